@@ -1,8 +1,8 @@
-"""ALIKED local features (Zhao et al., IEEE TIM 2023), with the keys of the official checkpoints.
+"""ALIKED local features (Zhao et al., IEEE TIM 2023), with the official parameter names.
 
-For inference only: batch normalisation is folded into the convolutions. The 128 channels are never
-computed at full resolution: the score head's first layer, a matrix product per pixel, is applied to
-each level before upsampling, and descriptors are sampled at keypoints only.
+The network is for inference only: batch normalisation is folded into the convolutions. The 128
+channels are never computed at full resolution: the score head's first layer, a matrix product per
+pixel, is applied to each level before upsampling, and descriptors are sampled at keypoints only.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from megloc_kapture.nets.score_maps import (
 )
 from megloc_kapture.values import LocalFeatures
 
-_TEMPERATURE = 0.1  # of the sub-pixel position, as in training
+_TEMPERATURE = 0.1  # softmax temperature of the sub-pixel position, as in training
 _MULTIPLE = 32
-_STRIP_ROWS = 2  # of the image per block of the score head's first layer, to fit the cache
+_STRIP_ROWS = 2  # image rows per block of the score head's first layer, which fits the CPU's cache
 _PATCH = 3
 _VALUES_AT_ONCE = {"cpu": 1 << 23, "cuda": 1 << 28}
 
@@ -49,7 +49,7 @@ class AlikedOptions(LocalNetworkOptions):
 
 
 class Aliked(LocalNetwork[AlikedOptions]):
-    """ALIKED keypoints (x, y, score) with descriptors of unit length, float32 (N, 64 or 128)."""
+    """ALIKED keypoints (x, y, score) with unit-norm descriptors, float32 (N, 64 or 128)."""
 
     name = "aliked"
     Options = AlikedOptions
@@ -82,7 +82,7 @@ class Aliked(LocalNetwork[AlikedOptions]):
         xy = soft_argmax(scores, keypoints.xy, options.nms_radius, _TEMPERATURE)
         height, width = scores.shape
         read = read_bilinear(scores.reshape(-1, 1), xy[:, 1], xy[:, 0], (height, width))
-        # the network's first pixel centre is (0, 0), COLMAP's (0.5, 0.5)
+        # the first pixel's centre is (0, 0) in the network, (0.5, 0.5) in COLMAP
         xy_px = xy.cpu().numpy() + np.float32(0.5)
         score = read[:, 0].cpu().numpy()
         return self._best(
@@ -94,7 +94,7 @@ class Aliked(LocalNetwork[AlikedOptions]):
 
 
 class AlikedNet(nn.Module):
-    """Network from image to score map and features; the keys are those of ``aliked-*.pth``."""
+    """Network from image to score map and features, with the keys of ``aliked-*.pth``."""
 
     def __init__(self, channels: tuple[int, int, int, int], positions: int) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class AlikedNet(nn.Module):
         self.desc_head = DescriptorHead(self.descriptor_size, positions)
 
     def forward(self, images: torch.Tensor) -> list[AlikedMaps]:
-        """Compute the maps of RGB images, (B, 3, H, W) in [0, 1]."""
+        """Compute the maps of RGB images (B, 3, H, W) in [0, 1]."""
         height, width = images.shape[2:]
         extra_y, extra_x = -height % _MULTIPLE, -width % _MULTIPLE
         top, left = extra_y // 2, extra_x // 2
@@ -182,7 +182,7 @@ class _Level:
 
 @dataclass(frozen=True, eq=False)
 class AlikedMaps:
-    """Maps of one image: scores float32 (H, W) in (0, 1), and features sampled at pixels."""
+    """Score map float32 (H, W) in (0, 1) of an image, and features that are sampled at pixels."""
 
     _net: AlikedNet
     scores: torch.Tensor
@@ -191,7 +191,7 @@ class AlikedMaps:
     _coarse: list[_Level]
 
     def features_at(self, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
-        """Return unit features (N, D) of pixels, int64 (N,) rows and columns."""
+        """Return unit-norm features (N, D) of pixels, given as int64 (N,) rows and columns."""
         row, column = rows + self._origin[0], columns + self._origin[1]
         height, width = self._fine.size
         parts = [self._net.fine_tap(self._fine.table[row * width + column])]
@@ -255,7 +255,7 @@ def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, t
 
 
 def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
-    """Build the network of a checkpoint, its variant inferred from shapes, in eval mode."""
+    """Build the network in eval mode, with its variant inferred from the checkpoint's shapes."""
     try:
         first = tensors["block1.conv1.weight"].shape[0]
         second, third, fourth = (tensors[f"conv{level}.weight"].shape[1] for level in (2, 3, 4))
@@ -279,7 +279,7 @@ class DescriptorHead(nn.Module):
         self.sf_conv = nn.Conv2d(size, size, 1, bias=False)
 
     def forward(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
-        """Return unit descriptors, float32 (N, D), at xy (N, 2); pixel centres are integers."""
+        """Return unit-norm descriptors float32 (N, D) at xy (N, 2); pixel centres are integers."""
         size = self.agg_weights.shape[1]
         at_once = _VALUES_AT_ONCE[xy.device.type] // (4 * self.positions * size)
         parts = [self._describe(maps, part) for part in torch.split(xy, max(at_once, 1))]

@@ -1,7 +1,7 @@
 """ASLFeat local features (Luo et al., CVPR 2020), with the official checkpoint converted.
 
-For inference only: batch normalisation is folded into the convolutions. The keys are TensorFlow's
-names in torch's notation (``scripts/convert_weights.py``).
+The network is for inference only: batch normalisation is folded into the convolutions. Parameters
+keep TensorFlow's names, written in torch's notation (``scripts/convert_weights.py``).
 """
 
 from __future__ import annotations
@@ -41,18 +41,19 @@ from megloc_kapture.nets.score_maps import (
 from megloc_kapture.values import LocalFeatures
 
 DESCRIPTOR_SIZE = 128
-STRIDE = 4  # of the features; feature (i, j) is at pixel (4 i, 4 j)
-# scored layers: dilation of the neighbourhood, and weight in the sum
+STRIDE = 4  # cell (i, j) of the descriptor map is centred at pixel (4 i, 4 j)
+# layers that add to the score map: dilation of the neighbourhood, and weight in the sum
 _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
 _NORM_EPSILON = 1e-5
+# the score map is computed in strips of at most this many activations, to bound memory
 _VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
 _BORDER_PX = 5
 _NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.float32), torch.zeros(0, DESCRIPTOR_SIZE))
 _SCALE_STEP = math.sqrt(0.5)
 _SMALLEST_SCALE = 0.3
 _SMALLEST_SIDE_PX = 128
-_BLUR_PX = 0.8  # in the smaller image, before each step
+_BLUR_PX = 0.8  # Gaussian sigma before each step, in pixels of the smaller image
 
 
 class AslFeatOptions(LocalNetworkOptions):
@@ -66,12 +67,12 @@ class AslFeatOptions(LocalNetworkOptions):
     )
     multi_scale: bool = Field(
         default=False,
-        description="also extract at 1/sqrt(2) and 1/2 of the size, for changes of scale",
+        description="also extract at 1/sqrt(2) and 1/2 of the image size, against scale changes",
     )
 
 
 class AslFeat(LocalNetwork[AslFeatOptions]):
-    """ASLFeat keypoints (x, y, score) with descriptors of unit length, float32 (N, 128)."""
+    """ASLFeat keypoints (x, y, score) with unit-norm descriptors, float32 (N, 128)."""
 
     name = "aslfeat"
     descriptor_size = DESCRIPTOR_SIZE
@@ -79,7 +80,7 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
-        # without contrast the network would see only its zero padding
+        # in a uniform image the network would respond only to its zero padding
         usable = [k for k, gray in enumerate(grays) if gray.min() != gray.max()]
         of_image = [_scales(grays[k]) if self.options.multi_scale else [grays[k]] for k in usable]
         levels_of: list[list[Level]] = [[] for _ in images]
@@ -110,7 +111,7 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
             scores = candidates.scores[kept]
             coarse = maps.features.shape[1], maps.features.shape[2]
             x, y = (xy / STRIDE).unbind(1)
-            # the border keeps keypoints inside the features
+            # _BORDER_PX keeps keypoints inside the descriptor map
             read = read_bilinear(pixel_table(maps.features), y, x, coarse)
             descriptors = functional.normalize(read, dim=1)
         xy_px = in_image_px(xy.cpu().numpy(), maps.scores.shape, full_size)
@@ -125,7 +126,7 @@ def _scales(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     for _ in range(number - 1):
         blurred = cv2.GaussianBlur(levels[-1], (0, 0), _BLUR_PX / _SCALE_STEP)
         height, width = (round(side * _SCALE_STEP) for side in blurred.shape)
-        # by size: with a factor, OpenCV ignores the rounding of the size
+        # pass the size: given a factor, OpenCV samples as if the size were not rounded
         resized = cv2.resize(blurred, (width, height))
         levels.append(np.asarray(resized, dtype=np.float32))
     return levels
@@ -133,7 +134,7 @@ def _scales(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 @dataclass(frozen=True, eq=False)
 class AslFeatMaps:
-    """Maps of one image: scores float32 (H, W), not negative; raw descriptors (128, h, w)."""
+    """Non-negative scores float32 (H, W) and unnormalised descriptors (128, h, w) of an image."""
 
     scores: torch.Tensor
     features: torch.Tensor
@@ -155,7 +156,7 @@ class AslFeatNet(nn.Module):
         self.tower = nn.ModuleDict({name: _Scale() for name in _SCORED})
 
     def forward(self, images: torch.Tensor) -> list[AslFeatMaps]:
-        """Compute the maps of gray images, (B, 1, H, W) in 0 to 255, at least 11 pixels a side."""
+        """Compute the maps of gray images (B, 1, H, W) in [0, 255], both sides at least 11 px."""
         height, width = images.shape[2:]
         normalised = []
         for image in torch.split(images, 1):
@@ -203,20 +204,20 @@ class _Norm(nn.Module):
         self.register_buffer("running_var", torch.ones(channels))
 
     def folded_into(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        scale, shift = self._line()
+        scale, shift = self._scale_and_shift()
         return weight * scale[:, None, None, None], shift
 
     def rectified_(self, x: torch.Tensor) -> torch.Tensor:
-        scale, shift = self._line()
+        scale, shift = self._scale_and_shift()
         return x.mul_(scale[:, None, None]).add_(shift[:, None, None]).relu_()
 
-    def _line(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _scale_and_shift(self) -> tuple[torch.Tensor, torch.Tensor]:
         scale = torch.rsqrt(self.running_var + _NORM_EPSILON)
         return scale, -self.running_mean * scale
 
 
 class _Conv(nn.Module):
-    """3x3 convolution without bias, padded as TensorFlow's SAME, and its normalisation."""
+    """3x3 convolution without bias, with TensorFlow's SAME padding and optional batch norm."""
 
     def __init__(
         self, inputs: int, outputs: int, *, stride: int = 1, normalised: bool = True
@@ -262,10 +263,11 @@ def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
 
 
 def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> torch.Tensor:
-    """Return the peakiness (H, W) of features (C, H, W) in space and among channels (eq. 6 to 8).
+    """Return the peakiness scores (H, W) of features (C, H, W) (equations 6 to 8 of ASLFeat).
 
-    max over channels of softplus(y - its mean over a 3x3 neighbourhood) times softplus(y - its mean
-    over the channels), where y = features / scale. The map is reflected at its border.
+    With y = features / scale, the score is the maximum over the channels of
+    softplus(y - local mean) * softplus(y - channel mean). The local mean is over a dilated 3x3
+    neighbourhood, with reflection padding.
     """
     channels, height, width = features.shape
     pixels = features.permute(1, 2, 0)
@@ -293,7 +295,7 @@ def _reflected(start: int, stop: int, size: int, device: torch.device) -> torch.
 
 
 def resize_as_tensorflow_1(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """Resize (h, w) to (H, W) bilinearly as TensorFlow 1: without half pixels, clamped."""
+    """Resize (h, w) to (H, W) bilinearly as TensorFlow 1 does: pixel i is read at i * h / H."""
     for axis, wanted in enumerate(size):
         given = values.shape[axis]
         if given == wanted:

@@ -66,7 +66,7 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
         self.name = stem if self.method in stem else f"{self.method}-{stem}"
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Describe an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
+        """Return the unit-norm descriptor float32 (D,) of an RGB image uint8 (H, W, 3)."""
         return self.describe_many([image])[0]
 
     def describe_many(self, images: Images) -> NDArray[np.float32]:
@@ -101,8 +101,8 @@ class _VggNetVladNetwork(GlobalNetwork[GlobalOptions]):
         height, width = batch.shape[-2:]
         if min(height, width) < STRIDE_PX:
             raise DataError(
-                f"an image of {width}x{height} pixels as the network sees it cannot be described: "
-                f"it needs {STRIDE_PX} a side"
+                f"the network's input has {width}x{height} pixels, but needs at least "
+                f"{STRIDE_PX} on each side"
             )
         half_precision = self.options.half_precision
         with inference(batch.device, half_precision):
@@ -116,7 +116,7 @@ class _VggNetVladNetwork(GlobalNetwork[GlobalOptions]):
 
 
 class NetVlad(_VggNetVladNetwork[NetVladOptions]):
-    """NetVLAD on VGG-16 with whitening: float32 (4096,), unit length."""
+    """NetVLAD on VGG-16 with whitening: unit-norm float32 (4096,)."""
 
     name = method = "netvlad"
     Options = NetVladOptions
@@ -134,7 +134,7 @@ class OpenIblOptions(GlobalNetworkOptions):
 
 
 class OpenIbl(_VggNetVladNetwork[OpenIblOptions]):
-    """OpenIBL's VGG-16 with NetVLAD and PCA: float32 (4096,), unit length."""
+    """OpenIBL's VGG-16 with NetVLAD and PCA: unit-norm float32 (4096,)."""
 
     name = method = "openibl"
     Options = OpenIblOptions
@@ -170,7 +170,7 @@ class ApGemOptions(GlobalNetworkOptions):
         default=0.25,
         ge=0,
         le=1,
-        description="power of the variances that components are divided by",
+        description="components are divided by their variances to this power",
     )
     max_size_px: int | None = Field(
         default=1024,
@@ -190,7 +190,7 @@ def _apgem_with_whitening(
 
 
 class ApGem(GlobalNetwork[ApGemOptions]):
-    """AP-GeM vectors, float32 (2048,), unit length; named after checkpoint, whitening and power."""
+    """AP-GeM: unit-norm float32 (2048,); checkpoint, whitening and power are in the type name."""
 
     name = method = "apgem"
     Options = ApGemOptions
@@ -228,7 +228,7 @@ class DelgOptions(GlobalNetworkOptions):
 
 
 class Delg(GlobalNetwork[DelgOptions]):
-    """DELG vectors of unit length, float32 (2048,)."""
+    """DELG's global descriptors: unit-norm float32 (2048,)."""
 
     name = method = "delg"
     Options = DelgOptions
@@ -263,7 +263,7 @@ class MegaLocOptions(GlobalNetworkOptions):
 
 
 class MegaLoc(GlobalNetwork[MegaLocOptions]):
-    """MegaLoc's unit vector, float32 (8448,), of an image scaled to a square as in the paper."""
+    """MegaLoc on an image resized to a square, as in the paper: unit-norm float32 (8448,)."""
 
     name = method = "megaloc"
     Options = MegaLocOptions

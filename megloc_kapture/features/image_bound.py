@@ -59,8 +59,8 @@ def max_megapixels_of(extractor: object) -> float:
 def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatures]:
     """Extract from images of one size, reduced to the extractor's limit.
 
-    Keypoints are in pixels of the given images. A pixel of a reduced mask is usable if all that it
-    covers is. For several images the extractor needs ``extract_many``.
+    Keypoints are in pixels of the given images. A pixel of a reduced mask is usable if all pixels
+    that it covers are. For several images the extractor needs ``extract_many``.
     """
     bound = max_megapixels_of(extractor)
     small = [_reduced(*frame, bound) for frame in frames]
@@ -96,7 +96,10 @@ def _scaled(features: LocalFeatures, ratio: NDArray[np.float32]) -> LocalFeature
 
 
 def on_mask(mask: NDArray[np.bool_], points_px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-    """Return which points (N, 2) lie on True pixels of a mask (H, W), clamped to the border."""
+    """Return a mask (N,) of the points (N, 2) on True pixels of a mask (H, W).
+
+    Points outside are clamped to the border.
+    """
     last = np.array(mask.shape[::-1]) - 1
     column, row = np.clip(points_px.astype(np.int64), 0, last).T
     return mask[row, column]

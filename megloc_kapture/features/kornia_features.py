@@ -28,7 +28,7 @@ from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.values import LocalFeatures
 
 _XFEAT_STRIDE_PX = 32  # XFeat rounds image sides down to multiples of it
-_ALL = 1 << 30  # keypoints: the mask is applied before the selection
+_ALL = 1 << 30  # detect all keypoints, since the mask is applied before the selection
 
 
 class _KorniaFeatures(LocalNetwork[LocalOptions]):
@@ -42,7 +42,7 @@ class _KorniaFeatures(LocalNetwork[LocalOptions]):
         features = []
         for (xy, scores, descriptors), mask in zip(detections, masks, strict=True):
             values = scores.float().cpu().numpy()
-            # kornia's first pixel centre is (0, 0)
+            # in kornia, the first pixel's centre is (0, 0)
             table = np.column_stack([xy.cpu().numpy() + offset_px, values]).astype(np.float32)
             rows_of = descriptors.float().cpu().__getitem__
             features.append(self._best(table, values, rows_of, mask))
@@ -62,7 +62,7 @@ class XFeatOptions(LocalNetworkOptions):
 class XFeat(_KorniaFeatures[XFeatOptions]):
     """The extractor ``xfeat``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 64).
 
-    Other descriptor weights make another feature type, named after their file.
+    Other descriptor weights define another feature type, named after their file.
     """
 
     name = "xfeat"
@@ -94,7 +94,7 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
 
 
 def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
-    """Return the offset (x, y) of COLMAP's pixels from kornia's, which are resized first."""
+    """Return the offset (x, y) from kornia's pixels to COLMAP's; kornia resizes images first."""
     sides = np.array([shape[1], shape[0]], np.float32)
     resized = np.maximum(sides // _XFEAT_STRIDE_PX, 1) * _XFEAT_STRIDE_PX
     return np.asarray(0.5 * sides / resized, np.float32)

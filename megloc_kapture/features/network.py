@@ -45,7 +45,7 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 
     @abstractmethod
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
-        """Extract from RGB images of one size in one batch; equal up to rounding."""
+        """Extract from RGB images of equal size in one batch; results differ only by rounding."""
 
     def _best(
         self,
@@ -54,7 +54,7 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
         describe: Callable[[torch.Tensor], torch.Tensor],
         mask: NDArray[np.bool_] | None,
     ) -> LocalFeatures:
-        """Select the best keypoints (N, 3), masked before; ties by y, then x."""
+        """Apply the mask and select the best keypoints (N, 3); ties are sorted by y, then x."""
         x, y = table[:, 0], table[:, 1]
         usable = np.arange(len(table))
         if mask is not None:
@@ -75,6 +75,6 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 def in_image_px(
     xy: NDArray[Any], size: Sequence[int], image_size: Sequence[int]
 ) -> NDArray[np.float32]:
-    """Convert positions (N, 2) of a map, first centre (0, 0), to pixels of the whole image."""
+    """Convert positions (N, 2) in a map to image pixels; the map's first centre is (0, 0)."""
     ratio = np.array([image_size[1] / size[1], image_size[0] / size[0]])
     return ((xy + 0.5) * ratio).astype(np.float32)

@@ -1,7 +1,7 @@
 """R2D2 local features (Revaud et al., NeurIPS 2019, section 3), the default of kapture's tools.
 
-The network has the keys of the official checkpoints: an L2-Net with dilations for strides, so that
-maps have full resolution, whose last 8x8 convolution is replaced by three of 2x2.
+The network is an L2-Net with dilations instead of strides, so that maps have full resolution, and
+with three 2x2 convolutions in place of the last 8x8 one. It has the official parameter names.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ DESCRIPTOR_SIZE = 128
 # kernel, width in units of the base width, dilation; ReLU after 3x3 kernels
 _LAYERS = ((3, 1, 1), (3, 1, 1), (3, 2, 1), (3, 2, 2), (3, 4, 2), (3, 4, 4), (2, 4, 4), (2, 4, 8))
 _STEPS_PER_OCTAVE = 4
-_TOLERANCE = 0.001  # of a scale: tolerance for a side rounded down by a pixel
+_TOLERANCE = 0.001  # tolerance of a scale, as a side may be rounded down by a pixel
 _DEFAULT_WEIGHTS = "r2d2_WASF_N16"
 _PATCH_PX = 32.0  # keypoint scale at full resolution, as in the authors' code
 
 
 class R2D2Options(LocalNetworkOptions):
-    """Options of R2D2; the authors' except for the number of keypoints."""
+    """Options of R2D2; defaults are the authors' values except for the number of keypoints."""
 
     weights: str = Field(default=_DEFAULT_WEIGHTS, description="name in the registry, or a file")
     max_keypoints: int = Field(
@@ -62,7 +62,7 @@ class R2D2(LocalNetwork[R2D2Options]):
     """The extractor ``r2d2``: keypoints (N, 3) = x, y, scale; descriptors float32 (N, 128).
 
     Keypoints come from all pyramid levels; the score is reliability times repeatability. Other
-    weights make another feature type, named after their file.
+    weights define another feature type, named after their file.
     """
 
     name = "r2d2"
@@ -150,7 +150,7 @@ class R2D2Network(nn.Module):
 
 
 def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
-    """Build the network of a checkpoint, with its width, for inference."""
+    """Build the network for inference, with its width inferred from the checkpoint's shapes."""
     first = tensors.get("ops.0.weight")
     if first is None or first.ndim != 4:
         raise DataError(
@@ -162,8 +162,8 @@ def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
 def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:
     """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each resized from the last.
 
-    R2D2's pyramid (Revaud et al., 2019, section 4), with limits of the longer side. An image
-    smaller than ``min_size`` is the only level.
+    This is R2D2's pyramid (Revaud et al., 2019, section 4), with limits on the longer side. An
+    image smaller than ``min_size`` has one level.
     """
     height, width = image.shape[-2:]
     longer = max(height, width)

@@ -52,15 +52,15 @@ class RootSift:
         options = self.options
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         sift = cv2.SIFT.create(
-            # OpenCV masks after the selection, so with a mask it gets no limit; and it cannot
-            # describe the masked keypoints only: without a keypoint of the first octave it builds
+            # OpenCV masks after the selection, so no limit is passed with a mask. It cannot
+            # describe the masked keypoints only: if none is in the first octave, it builds
             # another pyramid
             options.max_keypoints if mask is None else 0,
             3,
             options.contrast_threshold,
             options.edge_threshold,
             options.sigma_px,
-            True,  # precise upscaling: else the first octave is shifted by a quarter pixel
+            True,  # without precise upscaling, the first octave is shifted by a quarter pixel
         )
         keypoints, descriptors = sift.detectAndCompute(gray, None)
         if descriptors is None:
@@ -70,7 +70,7 @@ class RootSift:
             for keypoint in keypoints
         ]
         x, y, response, size, angle = np.array(rows, np.float64).reshape(-1, 5).T
-        # OpenCV's first pixel centre is (0, 0), COLMAP's (0.5, 0.5)
+        # the first pixel's centre is (0, 0) in OpenCV, (0.5, 0.5) in COLMAP
         xy_px = np.stack([x, y], axis=1) + 0.5
         order = np.lexsort((angle, size, x, y, -response))
         if mask is not None:
@@ -110,7 +110,7 @@ class ColmapSiftOptions(BoundedOptions):
 
 
 class ColmapSift:
-    """The extractor ``sift``; descriptors uint8 (N, 128), about 512 long."""
+    """The extractor ``sift``; descriptors uint8 (N, 128) have a norm of about 512."""
 
     name = "sift"
     descriptor_size = 128

@@ -1,9 +1,9 @@
 """SuperPoint local features (DeTone, Malisiewicz and Rabinovich, CVPR workshops 2018, section 3).
 
-The keys are those of Magic Leap's ``superpoint_v1.pth``, or of the MIT-licensed retraining's
-``superpoint_v6_from_tf.pth`` (rpautrat/SuperPoint), which normalises *after* each activation and
-whose descriptors do not fit SuperGlue's weights. Descriptors may come from a second checkpoint:
-MegLoc fine-tunes them with a frozen detector.
+Checkpoints have the keys of Magic Leap's ``superpoint_v1.pth`` or of ``superpoint_v6_from_tf.pth``,
+the MIT-licensed retrained network (rpautrat/SuperPoint). The latter normalises *after* each
+activation, and its descriptors do not work with SuperGlue's weights. Descriptors may come from a
+second checkpoint: MegLoc fine-tunes them with a frozen detector.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from megloc_kapture.values import LocalFeatures
 
 _OFFICIAL_WEIGHTS = "superpoint_v1"
 DESCRIPTOR_SIZE = 256
-_STRIP_ROWS = 64  # even; measured: fewer rows cost more halo, more do not fit the caches
+_STRIP_ROWS = 64  # even; fastest: fewer rows overlap more, more rows do not fit the CPU's caches
 DescriptorSampling = Literal["official", "exact"]
 _EPSILON = 1e-3  # TensorFlow's default, as in training
 
 
 class SuperPointOptions(LocalNetworkOptions):
-    """Options of SuperPoint; radius, threshold and border are the authors'."""
+    """Options of SuperPoint; NMS radius, threshold and border default to the authors' values."""
 
     weights: str = Field(
         default=_OFFICIAL_WEIGHTS,
@@ -57,16 +57,16 @@ class SuperPointOptions(LocalNetworkOptions):
     )
     descriptor_sampling: Literal["official", "exact"] = Field(
         default="official",
-        description="official: as the weights' authors, up to 3.5 px off in Magic Leap's, which "
-        "SuperGlue was trained with; exact: at the keypoint",
+        description="official: as the authors of the weights do; Magic Leap's sampling is up to "
+        "3.5 px off, and SuperGlue was trained with it; exact: at the keypoint",
     )
 
 
 class SuperPoint(LocalNetwork[SuperPointOptions]):
-    """SuperPoint keypoints (x, y, score) and descriptors, float32 (N, 256), unit length.
+    """SuperPoint keypoints (x, y, score) with unit-norm descriptors, float32 (N, 256).
 
-    Pixels beyond a multiple of 8 have no keypoints. Other weights than the official ones make
-    another feature type, named after their files.
+    Rows and columns beyond the last whole cell of 8 pixels have no keypoints. Weights other than
+    the official ones define another feature type, named after their files.
     """
 
     name = "superpoint"
@@ -107,7 +107,7 @@ class SuperPoint(LocalNetwork[SuperPointOptions]):
                 )
                 sampled = sample_descriptors(descriptors[k], keypoints.xy, sampling).cpu().numpy()
                 values = keypoints.scores.cpu().numpy()
-                # the network's first pixel is (0, 0), COLMAP's (0.5, 0.5)
+                # the first pixel's centre is (0, 0) in the network, (0.5, 0.5) in COLMAP
                 xy = keypoints.xy.cpu().numpy().astype(np.float32) + np.float32(0.5)
                 table = np.column_stack([xy, values])
                 sampled = np.ascontiguousarray(sampled)
@@ -144,11 +144,12 @@ class SuperPointNet(nn.Module):
         x = self._first_stage(gray)
         for first, second in ((self.conv2a, self.conv2b), (self.conv3a, self.conv3b)):
             x = second(functional.relu_(first(x)))
-            x = functional.relu_(functional.max_pool2d(x, 2))  # in this order four times cheaper
+            # ReLU after pooling is four times cheaper
+            x = functional.relu_(functional.max_pool2d(x, 2))
         return functional.relu_(self.conv4b(functional.relu_(self.conv4a(x))))
 
     def _first_stage(self, gray: torch.Tensor) -> torch.Tensor:
-        """Compute features (B, 64, H // 2, W // 2) in strips, to save memory traffic."""
+        """Compute features (B, 64, H // 2, W // 2) strip by strip, which saves memory traffic."""
         strips = []
         for top in range(0, gray.shape[2] // 2 * 2, _STRIP_ROWS):
             start = max(top - 2, 0)
@@ -164,8 +165,9 @@ class SuperPointNet(nn.Module):
         return functional.normalize(self.convDb(functional.relu_(self.convDa(features))), dim=1)
 
     def forward(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return scores (B, 8h, 8w) and unit descriptors (B, 256, h, w) of gray images (B, 1, H,
-        W).
+        """Return scores (B, 8h, 8w) and unit-norm descriptors (B, 256, h, w).
+
+        ``gray`` (B, 1, H, W) is in [0, 1]; h = H // 8, w = W // 8.
         """
         features = self.encode(gray)
         return self.detect(features), self.describe(features)
@@ -187,11 +189,11 @@ class SplitSuperPoint(nn.Module):
 def superpoint_from(
     tensors: Mapping[str, torch.Tensor], where: str, descriptor_weights: WeightsFile | None = None
 ) -> SuperPointNet | SplitSuperPoint | SuperPointBatchNormNet:
-    """Build the network of a checkpoint, of either layout, with optional descriptor weights."""
+    """Build the network of a checkpoint in either layout, with optional descriptor weights."""
     if any(key.startswith("backbone.") for key in tensors):
         if descriptor_weights is not None:
             raise OptionError(
-                f"descriptor_weights goes with weights of the layout of {_OFFICIAL_WEIGHTS}; "
+                f"descriptor_weights needs weights in the layout of {_OFFICIAL_WEIGHTS}; "
                 f"{where} has batch normalisation"
             )
         net = SuperPointBatchNormNet()
@@ -215,7 +217,7 @@ def superpoint_with_descriptor(
 ) -> SuperPointNet | SplitSuperPoint:
     """Combine the detector of one checkpoint with the descriptors of another.
 
-    A descriptor head without backbone uses the detector's features.
+    A descriptor head without a backbone uses the detector's features.
     """
     head = {key: value for key, value in descriptor.items() if not key.startswith("convP")}
     frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}
@@ -235,11 +237,11 @@ def superpoint_with_descriptor(
 def sample_descriptors(
     descriptors: torch.Tensor, xy: torch.Tensor, sampling: DescriptorSampling
 ) -> torch.Tensor:
-    """Sample descriptors (D, h, w) at pixels xy (N, 2), whose first centre is (0, 0), bilinearly.
+    """Sample a descriptor map (D, h, w) bilinearly at pixels (N, 2): unit-norm float32 (N, D).
 
-    ``exact`` puts the centre of cell (i, j) at pixel (8 i + 3.5, 8 j + 3.5). ``official`` has a
-    scale too small by (w - 1) / (w - 9/16), which drifts to 3.5 pixels at the bottom right;
-    SuperGlue was trained with it.
+    The first pixel's centre is (0, 0). ``exact`` puts the centre of cell (i, j) at pixel
+    (8 i + 3.5, 8 j + 3.5). ``official`` scales by a factor too small by (w - 1) / (w - 9/16): the
+    error grows to 3.5 pixels at the bottom right. SuperGlue was trained with it.
     """
     size, height, width = descriptors.shape
     if len(xy) == 0:

@@ -1,12 +1,12 @@
 """VLAD: aggregation of local descriptors into one global descriptor.
 
-Hard assignment: Jegou et al., CVPR 2010. Soft assignment: Arandjelovic et al., NetVLAD, CVPR 2016,
-equations 1 and 2, as in MegLoc::
+Hard assignment follows Jegou et al., CVPR 2010. Soft assignment, as in MegLoc, follows
+equations 1 and 2 of NetVLAD (Arandjelovic et al., CVPR 2016)::
 
     V(j, k) = sum_i a_k(x_i) (x_i(j) - c_k(j)),   a_k(x) = exp(-alpha |x - c_k|^2) / sum_k'(...)
 
-Intra-normalisation: Arandjelovic and Zisserman, All about VLAD, CVPR 2013. Whitening of several
-vocabularies: Jegou and Chum, ECCV 2012.
+Intra-normalisation follows Arandjelovic and Zisserman, All about VLAD, CVPR 2013; joint whitening
+of several vocabularies follows Jegou and Chum, ECCV 2012.
 """
 
 from __future__ import annotations
@@ -26,23 +26,25 @@ from megloc_kapture.values import Options
 Float32 = NDArray[np.float32]
 
 _CHUNK = 16384  # descriptors per block: bounds memory at 16384 x clusters floats
-# limits of the training of whitening: images, and numbers in total (1 GiB of float32)
+# whitening is learnt from at most this many images, and this many values (1 GiB of float32)
 _WHITENING_IMAGES = 4096
 _WHITENING_NUMBERS = 1 << 28
-_COLUMNS = 4096
-# relative variances below this are float32 rounding
+_COLUMNS = 4096  # dimensions per block when whitening is learnt
+# variances below this share of the largest are float32 rounding
 _LEAST = 1e-9
-# exponent of the deviations that whitening divides by, as in AP-GeM: with 1, as in Jegou and Chum,
-# all images of a small map are equally dissimilar
+# whitening divides by the standard deviations to this power, as AP-GeM does; with 1, as in Jegou
+# and Chum, all images of a small map are equally dissimilar
 WHITENING_POWER = 0.5
-# sharpness of soft assignment for unit descriptors; with 10 retrieval is worse
+# sharpness of soft assignment of unit-norm descriptors; 10 makes retrieval worse
 ALPHA = 30.0
-# descriptors that train a vocabulary, sampled evenly over the images; steps of Lloyd's algorithm
+# number of training descriptors of a vocabulary, sampled evenly over the images, and of Lloyd steps
 TRAINING_DESCRIPTORS, LLOYD_STEPS = 200_000, 20
 
 
 class VladOptions(Options):
-    num_clusters: int = Field(default=128, gt=0, description="of each vocabulary")
+    num_clusters: int = Field(
+        default=128, gt=0, description="number of visual words per vocabulary"
+    )
     vocabularies: int = Field(
         default=1,
         gt=0,
@@ -51,7 +53,7 @@ class VladOptions(Options):
     dimensions: int | None = Field(
         default=None,
         gt=0,
-        description="dimensions after PCA whitening learnt on the map, fewer than its images; "
+        description="dimensions after PCA whitening, fewer than the map's images; "
         "none: no whitening",
     )
     assignment: Literal["hard", "soft"] = "hard"
@@ -60,13 +62,13 @@ class VladOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class PcaWhitening:
-    """``y = projection (x - mean)``, then unit length (Jegou and Chum, ECCV 2012)."""
+    """PCA whitening ``projection (x - mean)``, scaled to unit norm (Jegou and Chum, ECCV 2012)."""
 
     mean: Float32
     projection: Float32
 
     def apply(self, vector: NDArray[np.floating[Any]]) -> Float32:
-        """Whiten one vector (D,): float32 (d,), unit length; zero stays zero."""
+        """Whiten one vector (D,) to float32 (d,) of unit norm; zero stays zero."""
         if not np.any(vector):
             return np.zeros(len(self.projection), dtype=np.float32)
         whitened = self.projection @ (np.asarray(vector, dtype=np.float32) - self.mean)
@@ -75,15 +77,16 @@ class PcaWhitening:
 
 
 def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
-    """Learn whitening from vectors (N, D), float32, which are overwritten.
+    """Learn whitening from vectors float32 (N, D), which are overwritten.
 
-    With few images the last components are noise, so deviations are raised to ``power`` below one
-    (Revaud et al., ICCV 2019). The rank, less than N, limits the number of dimensions.
+    Components are divided by their standard deviations to the ``power``; a power below one reduces
+    the noise of the last components if images are few (Revaud et al., ICCV 2019). ``dimensions`` is
+    limited by the rank of the centred vectors, which is less than N.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
     count, size = vectors.shape
-    # N x N Gram matrix: its eigenvectors give those of the D x D covariance
+    # the eigenvectors of the D x D covariance follow from those of the N x N Gram matrix
     gram = np.zeros((count, count))
     for start in range(0, size, _COLUMNS):
         part = vectors[:, start : start + _COLUMNS].astype(np.float64)
@@ -93,11 +96,11 @@ def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> Pc
     kept = min(dimensions, count - 1, int((variances > _LEAST * variances[0]).sum()))
     if kept < 1 or variances[0] <= 0:
         raise DataError(
-            f"whitening cannot be learnt from {count} images that do not differ: use more images, "
-            "or no whitening"
+            f"whitening cannot be learnt from {count} images with equal descriptors: use more "
+            "images, or no whitening"
         )
     variances, axes = variances[:kept], axes[:, :kept]
-    # rows of unit length in the vectors' space, divided by the deviations
+    # principal axes of unit length (D,), divided by the deviations
     rows = (axes / np.sqrt(count * variances) / variances ** (power / 2)).T
     projection = np.empty((kept, size), dtype=np.float32)
     for start in range(0, size, _COLUMNS):
@@ -122,7 +125,7 @@ class Vocabulary:
 
 
 Each = Callable[[Callable[[str], Float32], Iterable[str]], Iterable[Float32]]
-"""A parallel map."""
+"""Type of ``map`` or a parallel equivalent."""
 
 
 def train_vlad(
@@ -135,7 +138,8 @@ def train_vlad(
 ) -> Vocabulary:
     """Train vocabularies, and optionally their whitening, on the images of a map.
 
-    ``length`` and ``read`` return an image's number of descriptors and its descriptors (N, D).
+    ``length`` returns the number of an image's descriptors, ``read`` the descriptors (N, D).
+    ``each`` maps a function over images, possibly in parallel.
     """
     options = options or VladOptions()
     rows = sample_rows(map(length, images), TRAINING_DESCRIPTORS, options.seed)
@@ -152,7 +156,7 @@ def train_vlad(
     del sampled
     most = min(_WHITENING_IMAGES, max(2, _WHITENING_NUMBERS // vocabulary.size))
     described = [image for image, chosen in zip(images, rows, strict=True) if len(chosen)]
-    if len(described) > most:  # evenly over the names, and so over sequences
+    if len(described) > most:  # even over the names, so over sequences
         picks = np.linspace(0, len(described) - 1, most).round().astype(np.int64)
         described = [described[pick] for pick in picks]
     vectors = np.empty((len(described), vocabulary.size), dtype=np.float32)
@@ -176,11 +180,11 @@ def train_vocabulary(
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
     if len(data) < options.num_clusters:
         raise DataError(
-            f"a vocabulary of {options.num_clusters} clusters needs as many descriptors, the map "
-            f"has {len(data)}: use more images or fewer clusters"
+            f"a vocabulary of {options.num_clusters} clusters needs at least as many descriptors, "
+            f"but the map has {len(data)}: use more images or fewer clusters"
         )
     if not np.isfinite(data).all():
-        raise DataError("the map's descriptors have values that are not finite")
+        raise DataError("some of the map's descriptors are not finite")
     return Vocabulary(
         np.stack([_cluster(data, options, number) for number in range(options.vocabularies)])
     )
@@ -199,7 +203,7 @@ def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
         counts = np.bincount(labels, minlength=len(centres))
         filled = counts > 0
         centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
-        for k in np.flatnonzero(~filled):  # an empty cluster restarts elsewhere
+        for k in np.flatnonzero(~filled):  # an empty cluster restarts at a random descriptor
             centres[k] = data[rng.integers(len(data))]
     return centres
 
@@ -216,8 +220,7 @@ def _plus_plus(data: Float32, num_clusters: int, rng: np.random.Generator) -> Fl
         total = squared.sum()
         if total <= 0:
             raise DataError(
-                f"the map's descriptors have fewer than {num_clusters} distinct values: "
-                "use fewer clusters"
+                f"the map has fewer than {num_clusters} distinct descriptors: use fewer clusters"
             )
         centres.append(sample[rng.choice(len(sample), p=squared / total)])
     return np.stack(centres).astype(np.float32)
@@ -243,7 +246,10 @@ def _sum_by_label(
 
 
 def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np.int64]]:
-    """Sample about ``total`` descriptor rows of all images to train the vocabulary."""
+    """Sample about ``total`` descriptors evenly over the images; return each image's rows.
+
+    ``counts`` are the images' numbers of descriptors.
+    """
     counts = list(counts)
     rng = np.random.default_rng(seed)
     everything = sum(counts)
@@ -258,13 +264,13 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 def aggregate(
     descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
 ) -> Float32:
-    """Compute the VLAD of descriptors (N, D): float32, unit length; zero without descriptors."""
+    """Compute the VLAD float32 (M,) of descriptors (N, D), of unit norm; zero without any."""
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
     if len(data) and data.shape[1] != vocabulary.centres.shape[2]:
         raise DataError(
             f"descriptors have {data.shape[1]} dimensions, "
-            f"the vocabulary {vocabulary.centres.shape[2]}"
+            f"but the vocabulary has {vocabulary.centres.shape[2]}"
         )
     if len(data) == 0:
         return np.zeros(vocabulary.size, dtype=np.float32)
@@ -294,7 +300,7 @@ def soft_assignment(
     """Return ``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
     data = np.asarray(descriptors, dtype=np.float64)
     centres = np.asarray(centres, dtype=np.float64)
-    # |x|^2 cancels within a row
+    # |x|^2 is omitted because it cancels within a row
     logits = alpha * (2.0 * data @ centres.T - np.einsum("kd,kd->k", centres, centres))
     logits -= logits.max(axis=1, keepdims=True)
     weights = np.exp(logits)

@@ -23,7 +23,7 @@ PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
 RADIAL_MODELS = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 
 
-# models with two focal lengths whose distortion begins with that of the key, in the same order
+# models with two focal lengths whose distortion parameters begin with those of the key
 _TWO_FOCAL_MODEL = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
@@ -64,7 +64,7 @@ def scale_focal(camera: Camera, factor: float) -> Camera:
 
 
 def radial_distortion(camera: Camera) -> float:
-    """Return the factor of the squared radius, for RADIAL_MODELS."""
+    """Return the distortion parameter of the squared radius; the model is in RADIAL_MODELS."""
     return camera.params[_principal_point_index(camera) + 2]
 
 
@@ -85,13 +85,13 @@ def with_two_focals(camera: Camera) -> Camera:
 
 
 def same_lens(first: Camera, second: Camera) -> bool:
-    """Return whether two cameras differ at most in focal lengths and principal points."""
+    """Return True if two cameras differ at most in focal lengths and principal points."""
     a, b = with_two_focals(first), with_two_focals(second)
     return a.model == b.model and a.params[4:] == b.params[4:]
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """Scale to another image size, rounded to whole pixels; parameters follow the rounded sides."""
+    """Scale a camera; sides are rounded to whole pixels, and parameters follow rounded sides."""
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     x, y = width / camera.width, height / camera.height
     params = list(camera.params)
@@ -101,13 +101,13 @@ def scaled_camera(camera: Camera, scale: float) -> Camera:
 
 
 def reduced_camera(camera: Camera, max_side_px: int) -> Camera:
-    """Scale a camera down to a longer side; a smaller one is returned unchanged."""
+    """Scale a camera down to a longer side of at most ``max_side_px``."""
     longer = max(camera.width, camera.height)
     return camera if longer <= max_side_px else scaled_camera(camera, max_side_px / longer)
 
 
 def bearing_rays(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Return rays (x/z, y/z, 1) in the camera frame of pixels (N, 2); float64 (N, 3)."""
+    """Return the rays (x/z, y/z, 1) of pixels (N, 2) in the camera frame, float64 (N, 3)."""
     xy = normalized_from_px(camera, points_px)
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
 
@@ -134,7 +134,7 @@ def in_image(camera: Camera, px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]
         return np.asarray(((px >= 0) & (px < (camera.width, camera.height))).all(axis=1))
 
 
-# noise of a Kinect's depth at z, a + b z + c z^2 of 0.0012 + 0.0019 (z - 0.4)^2
+# a, b, c of a Kinect's depth noise a + b z + c z^2 = 0.0012 + 0.0019 (z - 0.4)^2
 STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 
 

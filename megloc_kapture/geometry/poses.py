@@ -29,11 +29,12 @@ _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
 _LATITUDE_ROUNDS = 8
 _ALIGNING_ROUNDS = 50
-_ALIGNING_PAIRS = 200  # with half of the poses right, every fourth pair is
-# between aligned poses; one of 30,000 random rotations agrees by chance
+_ALIGNING_PAIRS = 200  # if half of the poses are right, a quarter of the pairs is
+# largest angle of agreeing poses; one of 30,000 random rotations agrees by chance
 _AGREEMENT_DEG = 5.0
-_AGREEMENT_OF_SPREAD = 0.1  # of the centres' median distance from their median
-# required spread of the positions in two directions, in residuals, to determine scale and axes
+# largest distance of agreeing centres, as a share of the centres' median distance from their median
+_AGREEMENT_OF_SPREAD = 0.1
+# scale and axes need this spread of the positions in two directions, in residuals
 _MIN_SPREAD = 3.0
 # phone receivers claim no better; residuals of three positions may be smaller by chance
 _MIN_RESIDUAL_M = 1.0
@@ -207,13 +208,13 @@ def align_to_earth(
 ) -> EarthAlignment:
     """Estimate scale and axes of a map from its camera centres (3,) and their positions on earth.
 
-    Least squares (Umeyama 1991), reweighted by Cauchy's weights against outliers. Raises DataError
-    for fewer than three images, or images too near to each other or on a line.
+    The fit is by least squares (Umeyama 1991) with Cauchy weights. Raises DataError for fewer than
+    three images, or if the images are too close together or on a line.
     """
     names = sorted(centers.keys() & positions.keys())
     if len(names) < 3:
         raise DataError(
-            f"{len(names)} photographs of the map have a GPS position; the scale takes 3 or more"
+            f"{len(names)} photographs of the map have a GPS position; the scale needs 3 or more"
         )
     on_earth = np.array([earth_from_enu(*positions[name]).translation for name in names])
     origin = geodetic(np.median(on_earth, axis=0))
@@ -222,15 +223,16 @@ def align_to_earth(
     weights = np.ones(len(names))
     for _ in range(_ALIGNING_ROUNDS):
         scale, rotation, translation = _similarity(local, enu, weights)
-        apart = np.linalg.norm(scale * local @ rotation.T + translation - enu, axis=1)
-        weights = 1 / (1 + (apart / max(float(np.median(apart)), 1e-9)) ** 2)
-    residual_m = float(np.median(apart))
+        residuals_m = np.linalg.norm(scale * local @ rotation.T + translation - enu, axis=1)
+        weights = 1 / (1 + (residuals_m / max(float(np.median(residuals_m)), 1e-9)) ** 2)
+    residual_m = float(np.median(residuals_m))
     spread_m = np.linalg.svd(scale * (local - np.median(local, axis=0)), compute_uv=False)[1]
     spread_m /= np.sqrt(len(names))
     if spread_m < _MIN_SPREAD * max(residual_m, _MIN_RESIDUAL_M):
         raise DataError(
-            f"the GPS positions tell no scale: the photographs spread over {spread_m:.1f} m across "
-            f"their path, and the positions are good to {max(residual_m, _MIN_RESIDUAL_M):.1f} m"
+            "the GPS positions do not determine the scale: the photographs spread over "
+            f"{spread_m:.1f} m across their path, and the positions are accurate to "
+            f"{max(residual_m, _MIN_RESIDUAL_M):.1f} m"
         )
     return EarthAlignment(
         scale, RigidTransform.from_matrix(rotation, translation), origin, residual_m, len(names)
@@ -255,11 +257,12 @@ def align_poses(
 ) -> PoseAlignment:
     """Align ``cam_from_source`` with ``cam_from_target``: quaternions (N, 4), translations (N, 3).
 
-    The similarity (or rigid transform) through the pair with the most inliers is refitted to these.
+    A similarity (or rigid transform) is fitted to pairs of poses; the one with the most inliers is
+    refitted to its inliers.
     """
     number = len(source[0])
     if number < 3:
-        raise DataError(f"{number} poses have a true pose; an alignment takes 3 or more")
+        raise DataError(f"{number} poses have a true pose; an alignment needs 3 or more")
     centers = camera_centers(*source), camera_centers(*target)
     axes = rotation_matrices(source[0]), rotation_matrices(target[0])
     spread = np.median(np.linalg.norm(centers[1] - np.median(centers[1], axis=0), axis=1))
@@ -273,12 +276,13 @@ def align_poses(
         return 1.0, similarity[1], b.mean(axis=0) - similarity[1] @ a.mean(axis=0)
 
     def agreeing(scale: float, rotation: Floats, translation: Floats) -> NDArray[np.bool_]:
-        apart = np.linalg.norm(scale * centers[0] @ rotation.T + translation - centers[1], axis=1)
+        aligned = scale * centers[0] @ rotation.T + translation
+        distances = np.linalg.norm(aligned - centers[1], axis=1)
         # trace of rotation^T target_from_cam cam_from_source
         cosines = (np.einsum("nij,jk,nik->n", axes[1], rotation, axes[0]) - 1) / 2
-        turned = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-        near = apart <= _AGREEMENT_OF_SPREAD * spread
-        return near & (turned <= _AGREEMENT_DEG) & (scale > 0)
+        angles_deg = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        near = distances <= _AGREEMENT_OF_SPREAD * spread
+        return near & (angles_deg <= _AGREEMENT_DEG) & (scale > 0)
 
     rows = np.stack(np.triu_indices(number, 1), axis=1)
     if len(rows) > _ALIGNING_PAIRS:
@@ -286,14 +290,14 @@ def align_poses(
     agrees = np.zeros(number, np.bool_)
     for pair in rows:
         if np.any(centers[0][pair[0]] != centers[0][pair[1]]):
-            more = agreeing(*fit(pair))
-            agrees = more if more.sum() > agrees.sum() else agrees
+            inliers = agreeing(*fit(pair))
+            agrees = inliers if inliers.sum() > agrees.sum() else agrees
     best = fit(np.flatnonzero(agrees) if agrees.sum() > 1 else np.arange(number))
     for _ in range(_ALIGNING_ROUNDS):
-        more = agreeing(*best)
-        if more.sum() <= agrees.sum():
+        inliers = agreeing(*best)
+        if inliers.sum() <= agrees.sum():
             break
-        agrees, best = more, fit(np.flatnonzero(more))
+        agrees, best = inliers, fit(np.flatnonzero(inliers))
     scale, rotation, translation = best
     return PoseAlignment(
         scale,
@@ -316,7 +320,9 @@ def _similarity(
     a, b = source - means[0], target - means[1]
     spread = float((weights * (a**2).sum(axis=1)).sum())
     if spread == 0:
-        raise DataError("the photographs were all taken at one place: there is no scale to tell")
+        raise DataError(
+            "all photographs were taken at one place, which does not determine the scale"
+        )
     sizes = [np.sqrt((points**2).sum() / len(points)) or 1.0 for points in (a, b)]
     rotation = Rotation.align_vectors(
         np.concatenate([b / sizes[1], directions[1]]),
@@ -362,7 +368,7 @@ CONVENTIONS: Mapping[str, Callable[[RigidTransform], RigidTransform]] = {
     "translations read as camera centres": _center_given,
     "quaternions read as x, y, z, w": _quaternion_last,
 }
-"""By the name of each convention: the ``cam_from_world`` of a pose that was given in it."""
+"""Functions, by the name of each convention, that convert a pose given in it to COLMAP's."""
 
 
 def better_conventions(shares: Sequence[float]) -> list[str]:

@@ -211,18 +211,18 @@ def draw_depth_surface(
     near_m: float,
     field: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Draw a depth map as a surface of small triangles into another view's depth buffer.
+    """Render a depth map as a surface of small triangles into another view's depth buffer.
 
     The triangles join neighbouring pixels and leave no holes at any zoom; jumps in depth cut the
-    surface. Inverse depth is interpolated: it is linear in the pixels of an undistorted plane.
-    Return depth (H, W), infinite without a surface, and a mask (H, W) of its front side.
+    surface. Inverse depth is interpolated because it is linear in the pixels of an undistorted
+    plane. Returns depth (H, W), infinite without a surface, and a mask (H, W) of front faces.
 
     Parameters
     ----------
     depth_m : float32 (R, C); 0, negative or not finite where unknown.
     rays : (R * C, 3) through its pixel centres, z = 1, in the depth camera's frame.
     max_jump : largest difference between neighbouring depths, as a share of the nearer.
-    near_m, field : smallest depth in the view, largest tangent of the angle off its axis.
+    near_m, field : smallest depth in the view, and largest tangent of the angle off its axis.
     """
     rows, columns = depth_m.shape
     depth = np.ascontiguousarray(depth_m, np.float64)
@@ -239,7 +239,7 @@ def draw_depth_surface(
 
 @compiled_loop
 def _project(depth, rays, rotation, translation, model, params, near_m, field, px, z):
-    """Project the points of a depth map into the view; NaN where it cannot see one."""
+    """Project the points of a depth map into the view; NaN for points outside its field."""
     rows, columns = depth.shape
     out = np.empty(8)
     for r in range(rows):
@@ -266,7 +266,7 @@ def _joined(a, b, max_jump):
 
 @compiled_loop
 def _triangle(px, z, ar, ac, br, bc, cr, cc, inverse, front):
-    """Draw one triangle; the depth map sees its corners clockwise (y down)."""
+    """Draw one triangle, whose corners are clockwise in the depth map (y down)."""
     ax, ay = px[ar, ac, 0], px[ar, ac, 1]
     bx, by = px[br, bc, 0], px[br, bc, 1]
     cx, cy = px[cr, cc, 0], px[cr, cc, 1]

@@ -25,14 +25,14 @@ from megloc_kapture.geometry.cameras import (
 )
 from megloc_kapture.values import Camera, RigidTransform
 
-_NEAR_M = 0.02
-# references see the same surface if their depths in the view differ by less
+_NEAR_M = 0.02  # surfaces nearer to the view are clipped
+# references see the same surface if their depths in the view differ by less than this share
 _SAME_SURFACE = 0.02
-_MAX_JUMP = 0.05  # between neighbouring depths, share of the nearer
-# rays this much farther off the axis than the image's corners are not projected: distortion may
-# fold outside the image
+_MAX_JUMP = 0.05  # largest step between neighbouring depths of a surface, as a share of the nearer
+# rays farther off the axis than the image's corners by this factor are not projected: the
+# distortion model may fold over outside the image
 _FIELD_MARGIN = 1.2
-_SAME_CENTRE_M = 1e-9  # rounding of composed transforms
+_SAME_CENTRE_M = 1e-9  # smaller offsets are rounding of composed transforms
 _PER_ROW = 1024
 _WHOLE = 0.999  # minimum bilinear weight on usable pixels
 
@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class WarpSource:
-    """A reference image uint8 (H, W, 3) with depth, pose and a mask (H, W), True = use.
+    """A reference image uint8 (H, W, 3) with depth map, pose and optional mask (H, W), True = use.
 
     ``depth_m`` is along the axis of ``depth_camera``; 0, negative or NaN where unknown.
     """
@@ -60,7 +60,8 @@ class WarpedView:
     """A view rendered from references: RGB uint8 (H, W, 3), depth float32 (H, W).
 
     ``source`` is the index of the reference that gives the colour. Pixels that are not ``valid``
-    (holes, hidden surfaces, back sides) are 0 with source -1; back sides have depth.
+    (holes, back faces, surfaces that no reference sees) are black and have source -1. Depth is 0
+    only in holes.
     """
 
     image: NDArray[np.uint8]
@@ -76,10 +77,10 @@ def warp_to_view(
     *,
     scale: float = 1.0,
 ) -> WarpedView:
-    """Warp reference images into a view of any camera model, ``scale`` times its size.
+    """Warp reference images into a view of any camera model, rendered at ``scale`` times its size.
 
-    Of the references that see a surface, each pixel takes the one with the smallest angle between
-    the rays and a distance not much larger; ties go to the first.
+    Of the references that see a pixel's surface, the one with the smallest sum of viewing angle and
+    loss of resolution gives the colour; ties go to the first.
     """
     camera = scaled_camera(camera, scale)
     shape = camera.height, camera.width
@@ -111,7 +112,7 @@ def warp_to_view(
 def _seen_depth(
     source: WarpSource, camera: Camera, cam_from_world: RigidTransform
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the depth (H, W) of a reference's surface in a view, and its front side."""
+    """Return the depth (H, W) of a reference's surface in a view, and a mask of front faces."""
     from megloc_kapture.geometry.projection import draw_depth_surface
 
     return draw_depth_surface(
@@ -127,7 +128,7 @@ def _seen_depth(
 
 @lru_cache(maxsize=8)
 def _field(camera: Camera) -> float:
-    # corners and middles of the border
+    # corners and midpoints of the image border
     grid = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
     border = np.delete(grid, 4, axis=0) * (camera.width, camera.height)
     rays = bearing_rays(camera, border)
@@ -145,11 +146,11 @@ def _look_up(
     usable = np.asarray(np.isfinite(px).all(axis=1))
     if np.linalg.norm(source.image_from_depth.translation) > _SAME_CENTRE_M:
         usable &= _not_hidden(source, in_camera, px)
-    # OpenCV's coordinates have the centre of the first pixel at (0, 0)
+    # in OpenCV, the centre of the first pixel is (0, 0)
     in_array = np.where(usable[:, None], px, -1e4) * shrink - 0.5
     x, y = np.ascontiguousarray(in_array.T, np.float32)
     height, width = image.shape[:2]
-    # half a pixel beyond the outer centres still belongs to the image
+    # the image extends half a pixel beyond the outer pixel centres
     usable &= (x >= -0.5) & (y >= -0.5) & (x <= width - 0.5) & (y <= height - 0.5)
     colour = _remap(image, x, y)
     if mask is not None:
@@ -161,7 +162,7 @@ def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) 
     """Sample an array (H, W, ...) bilinearly at N positions."""
     if not len(x):
         return np.zeros((0, *array.shape[2:]), array.dtype)
-    # OpenCV takes no more than 32767 rows or columns
+    # fold the positions into rows, as OpenCV allows at most 32767 columns
     missing = -len(x) % _PER_ROW
     x, y = (np.pad(v, (0, missing)).reshape(-1, _PER_ROW) for v in (x, y))
     remapped = cv2.remap(array, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -171,7 +172,7 @@ def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) 
 def _at_resolution(
     source: WarpSource, focal: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None, Floats]:
-    """Return image and mask, reduced where finer than the view's pixels, and the scale (2,)."""
+    """Return image and mask, downscaled if they are finer than the view, and the scale (2,)."""
     height, width = source.image.shape[:2]
     factor = min(1.0, focal / focal_px(source.camera))
     mask = None if source.mask is None else source.mask.astype(np.float32)
@@ -185,7 +186,7 @@ def _at_resolution(
 
 
 def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
-    """Return a mask of the depth sensor's points (N, 3) that the image also sees."""
+    """Return a mask of the points (N, 3), seen by the depth sensor, that the image also sees."""
     surface, _ = _seen_depth(source, source.camera, source.cam_from_world)
     inside = in_image(source.camera, px)
     columns, rows = np.floor(np.where(inside[:, None], px, 0)).astype(np.int64).T
@@ -193,7 +194,10 @@ def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np
 
 
 def _cost(points: Floats, view_centre: Floats, source_centre: Floats) -> Floats:
-    """Return the angle between rays to points (N, 3) plus the log of the loss of resolution."""
+    """Return the angle between the two rays to each point plus the log of the loss of resolution.
+
+    The angle is in radians; the loss is the ratio of the distances, if above 1.
+    """
     to_view, to_source = view_centre - points, source_centre - points
     near, far = np.linalg.norm(to_view, axis=1), np.linalg.norm(to_source, axis=1)
     sine = np.linalg.norm(np.cross(to_view, to_source), axis=1)

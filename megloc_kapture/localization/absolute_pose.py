@@ -29,7 +29,7 @@ from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
 _RAND = threading.Lock()
 _ROUNDS = 2
 _MIN_SIGMA_PX = 0.1
-# median of the Rayleigh distribution
+# median of the Rayleigh distribution of scale 1
 _RAYLEIGH_MEDIAN = 1.1774100225154747
 # scale of the Cauchy loss for 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
@@ -37,7 +37,7 @@ _CAUCHY_EFFICIENT = 2.385
 _MIN_VARIANCE_PX2 = 0.1**2
 _MAX_CONDITION = 1e12
 _MAX_STEPS = 20
-# squared length of the last step, in standard deviations
+# iteration ends below this squared length of a step, in standard deviations
 _LAST_STEP = 1e-5
 # initial damping after a rejected step
 _DAMPING = 1e-4
@@ -45,7 +45,7 @@ _DAMPING = 1e-4
 _MIN_ITERATIONS, _MAX_ITERATIONS, _CONFIDENCE = 100, 20_000, 0.9999
 # largest standard deviation of the camera's centre, as a share of its inliers' median depth
 _MAX_CENTER_DEVIATION = 0.2
-# noise of the map's keypoints as a share of the residuals' (docs/experiments/pose.md)
+# noise of the map's keypoints relative to that of the residuals (docs/experiments/pose.md)
 _MAP_NOISE = 1 / 3
 Floats = NDArray[np.float64]
 
@@ -302,8 +302,8 @@ def refine_pose(
 ) -> Pose | Failure:
     """Refine an estimate of ``rig_from_world`` of the same problem.
 
-    The Pose has it as its ``cam_from_world``, with its covariance and the inlier mask over all
-    views (by errors in pixels, without the points' covariances).
+    It is the ``cam_from_world`` of the returned Pose, which also has the covariance and the inlier
+    mask over all views (by errors in pixels, without the points' covariances).
     """
     count = len(problem.points)
     pose = undo_recentring(estimate.rig_from_world, -problem.offset)
@@ -348,8 +348,8 @@ def _minimised(
 ) -> RigidTransform:
     """Minimise the Cauchy loss of whitened residuals by Levenberg-Marquardt.
 
-    With the weight ``w = 1 / (1 + e^2 / c^2)`` of a residual of length e, the gradient sums ``w J^T
-    r`` and the Hessian ``w^2 J^T J``, its expectation over directions of r.
+    A residual of length e has the weight ``w = 1 / (1 + e^2 / c^2)``. The gradient is the sum of
+    ``w J^T r``; the Hessian is that of ``w^2 J^T J``, its expectation over directions of r.
     """
     squared_scale = (_CAUCHY_EFFICIENT * sigma) ** 2
     best, least, damping = pose, np.inf, 0.0
@@ -396,9 +396,9 @@ def check_stable(
 
 
 def _variance(squared: Floats, squared_scale: float) -> float:
-    """Return the variance factor of the Cauchy estimate's covariance, of squared residuals (M,).
+    """Return the variance factor of a Cauchy estimate's covariance from squared residuals (M,).
 
-    Huber's proposal (Robust Statistics, section 7.6): ``E[w^2 e^2] / 2`` over ``E[w^2]^2``.
+    Huber proposes ``E[w^2 e^2] / 2`` over ``E[w^2]^2`` (Robust Statistics, section 7.6).
     """
     squared_weights = 1.0 / (1.0 + squared / squared_scale) ** 2
     degrees_of_freedom = max(2 * len(squared) - 6, 1)
@@ -416,8 +416,8 @@ def _median(values: Floats) -> float:
 def pose_covariance(information: Floats, variance_px2: float) -> Floats | None:
     """Return the pose covariance (6, 6) from the normal matrix ``J^T J`` for a noise of 1 px.
 
-    Rotation in radians, then translation, of a left perturbation ``exp(...) cam_from_world``; None
-    if singular.
+    The left perturbation ``exp(...) cam_from_world`` is ordered rotation in radians, then
+    translation. None if the matrix is singular.
     """
     if not np.isfinite(information).all() or not (np.diagonal(information) > 0).all():
         return None

@@ -46,9 +46,9 @@ OfViews = Sequence[Sequence[Correspondences]]
 """2D-3D matches of each view, by keypoints type."""
 
 
-# images with fewer points in common belong to no common cluster
+# images that share fewer points are not linked
 _MIN_SHARED_POINTS = 10
-# clusters with the most matches; each gets a pose
+# only this many clusters, those with the most matches, get a pose
 MAX_CLUSTERS = 10
 
 
@@ -61,8 +61,8 @@ class ClusterOptions(Options):
     radius: float | None = Field(
         default=None,
         gt=0,
-        description="for poses: images with centres this close are linked; connected images form a "
-        "cluster; in map units",
+        description="for poses: largest distance of linked camera centres, in map units; connected "
+        "images form a cluster",
     )
 
     @model_validator(mode="after")
@@ -162,7 +162,7 @@ def localize_in_clusters(
     frames : coordinate frame of each cluster; clusters of different frames are not merged.
     centers : of the map images, (3,) each; needed for ``min_confidence``.
     min_confidence : poses of lower confidence fail; None computes no confidence.
-    scene : images used if the confidence is in doubt.
+    scene : images that are compared if the confidence is in doubt.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])

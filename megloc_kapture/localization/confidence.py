@@ -1,10 +1,9 @@
 """Confidence of a pose: the probability that it is right, estimated without ground truth.
 
-:func:`evidence_of` measures how far the inliers exceed chance, their share of all matches and of
-the matchable points, how well they fit compared with the map's own images, how firmly they
-determine the pose, and the viewpoints of the map images that observe them. :class:`Calibration` is
-a logistic model of these terms; ``benchmarks/confidence.py`` fits its weights
-(``confidence.toml``).
+:func:`evidence_of` measures by how much the inliers exceed chance, their share of all matches and
+of the matchable points, their fit compared with that of the map's images, the uncertainty of the
+pose, and the viewpoints of the map images that observe them. :class:`Calibration` is a logistic
+model of these terms; ``benchmarks/confidence.py`` fits its weights (``confidence.toml``).
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
 _SAMPLE = 3  # matches that determine a pose
-_CELL = 0.01  # share of the image's diagonal within which inliers count once
-# a wrong map of few points agrees with itself: poses with fewer visible points are doubtful
+_CELL = 0.01  # cell size as a share of the image's diagonal; a cell's inliers count once
+# a small wrong map is consistent with itself, so poses with fewer visible points are doubtful
 _MIN_VISIBLE = 50
-_MAX_PROJECTED = 2048  # points to estimate the visible share
+_MAX_PROJECTED = 2048  # number of points that estimate the visible share
 _MIN_ERROR_PX = 0.5
-_MIN_NOISE_PX = 0.3  # least map noise, pixels of the query
-# largest usual ratio of an image's error to the map's noise, and least inliers to measure it
+_MIN_NOISE_PX = 0.3  # smallest map noise, pixels of the query
+# largest usual ratio of an image's error to the map's noise, measured with more than _FEW inliers
 _USUAL_RATIO, _FEW = 2.9, 20
 # tolerated motion by a wrong focal length, as a share of the distance to the points
 _TOLERATED_SHIFT = 0.03
@@ -49,10 +48,10 @@ TERMS: dict[str, str] = {
     "distance_ratio": "the map's images see these points from another distance",
     "support": "few map images agree with the pose",
 }
-"""Terms of the model, with the reason that a low contribution gives."""
+"""Terms of the model, with the reason to report if a term's contribution is the lowest."""
 
 MAP_POINTS = "map_points"
-"""Number of visible map points over the number that a trusted pose needs; present only below 1."""
+"""Ratio of visible map points to those that a trusted pose needs; present only below 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +63,12 @@ class MatchSources:
     support : int64 (N,), number of map images with the match.
     centers, images : float64 (sum of support, 3) and int64, the map images' centres and indices,
         grouped by match.
-    num_keypoints : of the query, over all views and types.
+    num_keypoints : number of the query's keypoints, over all views and types.
     noise : float64 (N, 2), the map's median reprojection error as angle and in pixels; NaN if
         unknown.
     seen : per view the points (K, 3) observed by the cluster's map images.
-    displacements_rad : returns how far image patches of the map are displaced from a pose's
-        projections, see :func:`~.structure.displacements_rad`.
+    displacements_rad : returns the displacements of map image patches from a pose's projections,
+        see :func:`~.structure.displacements_rad`.
     """
 
     support: NDArray[np.int64]
@@ -126,7 +125,8 @@ def with_confidence(
 ) -> Pose | Failure:
     """Return the pose with its confidence and evidence, or a Failure if the confidence is too low.
 
-    A misfitting focal length moves the camera: the confidence falls with the square of that shift.
+    A misfitting focal length shifts the camera, and the confidence falls with the square of this
+    shift.
     """
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
@@ -154,9 +154,9 @@ def with_confidence(
 def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> float:
     """Return -log10 of the number of false alarms of the inliers, at least 0.
 
-    A contrario (Moisan and Stival, IJCV 2004; for poses Moulon et al., ACCV 2012): a wrong match
-    falls within r of its projection with the probability of that disc in the image. The most
-    surprising radius counts, and matches in one cell count once.
+    This is the a-contrario model (Moisan and Stival, IJCV 2004; for poses Moulon et al., ACCV
+    2012): a wrong match is within r of its projection with a probability equal to the disc's share
+    of the image. The most surprising radius counts, and matches in one cell count once.
     """
     from scipy.special import gammaln
 
@@ -176,7 +176,7 @@ def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> f
     num = len(error)
     order = np.argsort(error, kind="stable")[: int((error <= max_error_px).sum())]
     counts = np.arange(1, len(order) + 1)
-    # largest disc of the k best
+    # largest disc among the k best matches
     shares_of_best = np.maximum.accumulate(share[order])
     many = counts > _SAMPLE
     if not many.any():
@@ -198,19 +198,19 @@ def _misfit(
     inliers: NDArray[np.bool_],
     sources: MatchSources,
 ) -> float:
-    """Return by how much the inliers together fit worse than the map's own images.
+    """Return by how much the inliers fit worse than the map's own images, at least 0.
 
-    A mirrored or similar scene has hundreds of inliers that almost fit. The ratio of the inliers'
-    median angular error (or of their image patches' displacement, if smaller: keypoints move at
-    night) to the error expected from map and points, beyond the usual ratio, as a logarithm times
-    that of their number; 0 if the map's noise is unknown.
+    A mirrored or similar scene has hundreds of inliers that almost fit. The ratio is the inliers'
+    median angular error over the error expected from map and points. If the median displacement of
+    their image patches is smaller, it replaces the error, since keypoints move at night. The result
+    is log(ratio / usual ratio) log(number / 20), or 0 if the map's noise is unknown.
     """
     lengths = np.diff(problem.starts)
     focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)
     # noise is an angle if the query is sharper than the map's images, else it is in pixels
     noise_rad, noise_px = sources.noise.T
     own_px = np.maximum(noise_rad * focals, np.maximum(noise_px, _MIN_NOISE_PX))
-    # points of little parallax have larger errors seen from elsewhere
+    # points of small parallax have larger errors in images from other viewpoints
     share = (noise_px / own_px)[:, None] ** 2
     relative = replace(problem, covariances=problem.covariances * share[: len(problem.covariances)])
     _, explained = match_errors(relative, pose.cam_from_world)
@@ -247,8 +247,9 @@ def _viewpoints(
     inliers: NDArray[np.bool_],
     sighted: NDArray[np.bool_],
 ) -> tuple[float, float]:
-    """Return medians over the inliers' map observations: viewing angle over 90 deg, and |log2| of
-    the distance ratio.
+    """Return medians over the inliers' map observations.
+
+    They are the viewing angle divided by 90 deg, and |log2| of the distance ratio.
     """
     seen = np.repeat(points, sources.support[inliers], axis=0)
     ours, theirs = center - seen, sources.centers[sighted] - seen
@@ -262,7 +263,7 @@ def _viewpoints(
 
 @dataclass(frozen=True)
 class Calibration:
-    """Logistic model of the confidence; terms without a weight do not count."""
+    """Logistic model of the confidence; terms without a weight are ignored."""
 
     origin: str
     bias: float
@@ -293,7 +294,7 @@ def calibrations() -> Mapping[str, Calibration]:
 
 
 def calibration_for(local_types: Collection[str]) -> Calibration:
-    """Return the calibration shared by all keypoints types."""
+    """Return the calibration of the keypoints types, or of :data:`OF_ALL` if theirs differ."""
     known = calibrations()
     names = {
         next((name for name in known if name != OF_ALL and local_type.startswith(name)), OF_ALL)

@@ -40,21 +40,21 @@ from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, LocalizationResult, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
-# map errors of neighbouring points are correlated: deviations that assume independent matches are
-# too small by this factor (measured: docs/photos.md)
+# map errors of neighbouring points are correlated, so deviations that assume independent matches
+# are too small by this factor (measured in docs/photos.md)
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
 _MIN_SIGMAS = 3.0
 _MIN_INLIERS = 30
 _DOES_NOT_FIT = "does not fit"
 _ROUNDS = 12
 _SMALL_STEP = 1e-4
-# relative change of the focal length at convergence
+# largest relative change of a converged focal length
 _SETTLED = 1e-4
 _MAX_UPDATES = 8
-# the prior is doubted if P4Pf's focal length differs by more deviations
+# the prior is doubted if P4Pf's focal length differs from it by more standard deviations
 _MAX_DEVIATIONS = 3.0
-# prior deviation of a focal length that the matches contradict; smaller deviations are never
-# doubted: they come from calibration or several images
+# prior deviation of a focal length that the matches contradict; a focal length with a smaller
+# deviation than the second value comes from calibration or several images and is never doubted
 _DOUBTED_DEVIATION, _MIN_DOUBTED = 0.7, 0.1
 # prior standard deviations: principal point as a share of the larger side, radial distortion
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
@@ -62,12 +62,11 @@ _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
 _CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
 # effective number of independent matches
 _INDEPENDENT = 30
-# matches were verified with the given focal length, which biases the free one: deviation as a share
-# of the difference
+# verification with the given focal length biases the free one by this share of their difference
 _BIASED_BY = 0.1
 # beyond this many standard deviations, the zoom differs
 _MAX_SIGMAS = 3.0
-# map and lens model errors are correlated between photographs (measured: docs/photos.md)
+# map and lens model errors are correlated between photographs (measured in docs/photos.md)
 _ALIKE = 2.0
 
 
@@ -94,8 +93,9 @@ def is_uncertain(problem: PoseProblem) -> bool:
 
 @dataclass(frozen=True)
 class FocalMisfit:
-    """A focal length that fits far better; ``shift``: motion of the camera over the points'
-    distance.
+    """A focal length that fits far better.
+
+    ``shift`` is the motion of the camera divided by the points' distance.
     """
 
     remark: str
@@ -253,7 +253,7 @@ def estimate_with_intrinsics(
 
 
 def _scaled(given: Camera, focal: float) -> Camera:
-    """Set the focal length; weaken the prior if it is contradicted."""
+    """Set the focal length; weaken the prior if the matches contradict it."""
     camera = scale_focal(given, focal / focal_px(given))
     if abs(math.log(focal / focal_px(given))) > _MAX_DEVIATIONS * given.focal_deviation:
         return replace(camera, focal_deviation=max(_DOUBTED_DEVIATION, given.focal_deviation))
@@ -318,7 +318,7 @@ def _changed(camera: Camera, change: Floats) -> Camera:
 
 
 def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
-    """Return the change from a camera to the given one, and its standard deviations."""
+    """Return the change from a camera to the given one, and the prior's standard deviations."""
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
     known = max(given.focal_deviation, camera.focal_deviation)

@@ -1,4 +1,4 @@
-"""Image distance LPIPS, with the published weights."""
+"""Plugin for the image distance LPIPS, by default with the published weights."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ class LpipsOptions(NetworkOptions):
 class LpipsDistance:
     """Plugin ``lpips``: LPIPS 0.1 (:class:`megloc_kapture.nets.lpips.Lpips`) over the valid pixels.
 
-    With other weights it is named ``lpips-like``: its values do not compare with published ones.
+    With other weights its name is ``lpips-like-NET``, since its values are not comparable with
+    published ones.
     """
 
     name = "lpips"
@@ -53,21 +54,20 @@ class LpipsDistance:
     def distance(
         self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> float:
-        """Return the distance of RGB images uint8 (H, W, 3) over the valid pixels (H, W), 0 or
-        more.
+        """Return the distance, at least 0, of RGB images uint8 (H, W, 3) over ``valid`` (H, W).
 
-        Infinite without valid pixels, or if the images are too small for the network.
+        It is infinite without valid pixels or if the images are too small for the network.
         """
         if not valid.any() or min(valid.shape) < SMALLEST_PX:
             return float("inf")
         device = pick_device(self.options.device)
         network = _network(self.options.net, self._trunk, self._heads, device)
         with inference(device, self.options.half_precision):
-            counts = torch.from_numpy(valid.astype(np.float32)).to(device)[None, None]
-            ours, theirs = (
-                network.described(image_tensor(image, device), counts) for image in (a, b)
+            mask = torch.from_numpy(valid.astype(np.float32)).to(device)[None, None]
+            first, second = (
+                network.described(image_tensor(image, device), mask) for image in (a, b)
             )
-            return float(network.between(ours, theirs, counts)[0])
+            return float(network.between(first, second, mask)[0])
 
 
 @lru_cache(maxsize=2)

@@ -92,8 +92,9 @@ class MapIndex:
         return self.xyz[np.flatnonzero(seen)]
 
     def shared_points(self, images: Sequence[str]) -> NDArray[np.int64]:
-        """Count the points observed by both of two images, int64 (n, n); the diagonal has each
-        one's own.
+        """Count the points that pairs of images share, int64 (n, n).
+
+        The diagonal has the number of points of each image.
         """
         count, seen_by = len(images), [self.observed(image)[1] for image in images]
         rows = np.repeat(np.arange(count), [len(points) for points in seen_by])
@@ -148,8 +149,8 @@ def resolve_conflicts(
 ) -> Correspondences:
     """Select one point per keypoint and one keypoint per point from conflicting matches (M,).
 
-    Greedy from the best: triangulated points before lifted ones (``seen_once``), then by the number
-    of map images (``image_rows``), then by similarity, then by smaller ids.
+    The selection is greedy. Triangulated points precede lifted ones (``seen_once``); then the order
+    is by number of map images (``image_rows``), similarity and ids.
     """
     if len(keypoint_ids) == 0:
         none = np.zeros(0, dtype=np.int64)
@@ -219,13 +220,13 @@ class TypedMatches:
         )
 
     def are_with(self, images: Sequence[str]) -> NDArray[np.bool_]:
-        """Return a mask (M,) of the observed matches with some images."""
+        """Return a mask (M,) of the observed matches with a subset of the images."""
         members = set(images)
         asked = np.array([image in members for image, _, _ in self.matches], bool)
         return np.asarray(asked[self.observed[3]])
 
     def correspondences(self, images: Sequence[str] | None = None) -> Correspondences:
-        """Return 2D-3D matches with some images, or all; see :func:`resolve_conflicts`."""
+        """Return 2D-3D matches with some or all images; see :func:`resolve_conflicts`."""
         taken: Any = slice(None) if images is None else self.are_with(images)
         keypoint_ids, point_ids, similarities, image_rows = self.observed
         return resolve_conflicts(

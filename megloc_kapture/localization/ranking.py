@@ -107,7 +107,7 @@ def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ANOTHER_VIEW = 0.2  # least difference of references, radians
+_ANOTHER_VIEW = 0.2  # smallest difference of two references, radians
 
 
 class PerceptualOptions(Options):
@@ -115,7 +115,7 @@ class PerceptualOptions(Options):
         default=5,
         ge=1,
         le=1000,
-        description="number of map images with depth per view: the nearest ones that differ",
+        description="number of map images with depth per view: the nearest without near duplicates",
     )
     long_side: int = Field(
         default=320, ge=16, description="longer side of the compared views, pixels; never enlarged"
@@ -124,8 +124,12 @@ class PerceptualOptions(Options):
         default=PluginChoice(name="structure"),
         description="distance of two aligned images: structure, lpips, or a plugin",
     )
-    device: Device = Field(default="auto", description="of the distance: auto, cpu, cuda or cuda:N")
-    half_precision: bool = Field(default=False, description="of the distance")
+    device: Device = Field(
+        default="auto", description="device of the distance: auto, cpu, cuda or cuda:N"
+    )
+    half_precision: bool = Field(
+        default=False, description="compute the distance in half precision"
+    )
     min_inlier_share: float = Field(
         default=0.05,
         ge=0,
@@ -142,7 +146,7 @@ class PerceptualOptions(Options):
     finalists: int = Field(
         default=6,
         ge=1,
-        description="number of clusters with the least distance that are compared in pairs",
+        description="number of clusters, those with the smallest distance, compared in pairs",
     )
 
 
@@ -155,11 +159,11 @@ class _Compared(NamedTuple):
 class PerceptualRanker:
     """Plugin ``perceptual``: smallest image distance of the query to the view warped to its pose.
 
-    Clusters with a fair share of the most inliers are compared. The best by their own distance, the
-    finalists, are compared pairwise over pixels valid in both, since distances over different image
-    parts do not compare; a score is the mean margin. The others follow by their own distance, then
-    clusters without depth or with few inliers. If the best cluster of ``distinctive`` has no valid
-    view, that ranker's scores are returned.
+    Only clusters with enough inliers take part (``min_inlier_share``). Those with the smallest
+    distances, the finalists, are compared pairwise over the pixels valid in both, since distances
+    over different image parts are not comparable; a finalist's score is its mean margin. The others
+    follow by their distance, then clusters without depth or with few inliers. If the best cluster
+    of ``distinctive`` has no valid view, that ranker's scores are returned.
     """
 
     Options = PerceptualOptions
@@ -234,7 +238,7 @@ class PerceptualRanker:
         distances: Floats,
         at: NDArray[np.int64],
     ) -> Floats:
-        """Return how much smaller each distance is than the others', on average."""
+        """Return by how much each distance is smaller than the others', on average."""
         margins = np.zeros(len(finalists))
         for i, first in enumerate(finalists):
             for j, second in enumerate(finalists[:i]):
@@ -242,7 +246,7 @@ class PerceptualRanker:
                     continue
                 both = [a.valid & b.valid for a, b in zip(first, second, strict=True)]
                 margin = self._mean_distance(second, both) - self._mean_distance(first, both)
-                if not np.isfinite(margin):  # they show nothing in common
+                if not np.isfinite(margin):  # too few pixels are valid in both
                     margin = distances[at[j]] - distances[at[i]]
                 margins[i] += margin
                 margins[j] -= margin

@@ -18,15 +18,15 @@ from megloc_kapture.localization.map_index import Correspondences, PoseProblem, 
 from megloc_kapture.plugins import RankingScene
 from megloc_kapture.values import Camera, Options, Pose, RigidTransform
 
-_NOISE_VARIANCE = 9.0  # grey levels squared: what varies less is no structure
-_MIN_FILLED = 0.5  # of a window, the share that must be valid
-# surroundings of a point, and how far they are looked for; of a query as it is localized
+_NOISE_VARIANCE = 9.0  # the constant c, grey levels squared: smaller variance counts as noise
+_MIN_FILLED = 0.5  # smallest valid share of a window
+# half side of a point's patch and radius of its search, in pixels of the localized query
 _HALF_PATCH_PX, _SEARCH_PX = 12, 6
-# of an image, and of a view: what is looked at takes time
+# limits that bound the time: points per view, and map images that patches are taken from
 _MAX_POINTS, _MAX_IMAGES = 300, 4
-# surroundings without texture say nothing, and such that look alike less are not found
+# a patch with a smaller deviation has no texture; one with a smaller correlation is not found
 _MIN_DEVIATION, _MIN_CORRELATION = 5.0, 0.6
-# surroundings are compared as planes that face the camera
+# patches are compared as planes that face the camera
 _MAX_SCALE = 2.0
 Float32 = NDArray[np.float32]
 
@@ -66,7 +66,7 @@ class StructureDistance:
         weight = valid.astype(np.float32)
 
         def blurred(values: Float32) -> Float32:
-            # beyond the border nothing is valid
+            # pixels beyond the border are invalid
             smooth = cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
             return np.asarray(smooth, np.float32)
 
@@ -107,14 +107,14 @@ def displacements_rad(
     scene: RankingScene,
     pose: Pose,
 ) -> NDArray[np.float64]:
-    """Return the angles between inliers' projections and the same patches found in the query.
+    """Return angles (K,) in radians between inliers' projections and their patches in the query.
 
-    Detectors find other points of the same corner at night or in another season, although the pose
-    is right; the patch around it, taken from the first map image of a match, is then at the
-    projection. In a similar or mirrored scene it is displaced like its keypoint. Empty without
-    pixels of query or map.
+    A patch is taken around the point in the first map image of the match. At night or in another
+    season, detectors find other points of the same corner although the pose is right; the patch is
+    then at the projection. In a similar or mirrored scene the patch is displaced like the keypoint.
+    Empty if images cannot be read.
     """
-    assert pose.inliers is not None  # it was estimated here
+    assert pose.inliers is not None  # poses estimated by localization have them
     angles = [np.zeros(0)]
     inliers = problem.split(pose.inliers)
     for query, view, of_types, kept in zip(
@@ -185,7 +185,7 @@ def _displacements_in(
     for row in np.flatnonzero(usable):
         cos, sin = math.cos(angle) / scales[row], -math.sin(angle) / scales[row]
         map_from_patch = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]])
-        middle = in_map[row] - 0.5  # OpenCV counts from the middle of the first pixel
+        middle = in_map[row] - 0.5  # in OpenCV, the centre of the first pixel is (0, 0)
         map_from_patch[:, 2] = middle - map_from_patch[:, :2].sum(axis=1) * _HALF_PATCH_PX
         patch = cv2.warpAffine(
             shown, map_from_patch, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

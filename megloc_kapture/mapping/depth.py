@@ -1,7 +1,8 @@
-"""Depth maps of map images: keypoints lifted to 3D points, and points verified by depth.
+"""Depth maps of map images, which lift keypoints to 3D points and verify triangulated points.
 
-A point observed by an image with depth must lie on the surface seen by the sensor, within the noise
-of sensor and point and a small window for edges. Without depth nothing is rejected.
+A point observed by an image must lie on the surface that the depth sensor measured there. The
+tolerance covers the noise of sensor and point, and a small window allows for edges. Observations
+without depth are kept.
 """
 
 from __future__ import annotations
@@ -22,21 +23,22 @@ from megloc_kapture.geometry.cameras import (
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-# a point's pixel in a depth sensor next to the camera depends on its depth, so it is iterated;
-# points that do not converge are behind an edge
+# if the depth sensor is next to the camera, a keypoint's pixel in the depth map depends on its
+# depth, so both are iterated; points that do not converge are hidden behind an edge
 _ROUNDS = 6
-_SETTLED = 0.01
-# one over the keypoint noise, in pixels, of the deviations of estimated depth
+_SETTLED = 0.01  # largest last change of a converged depth, relative
+# deviations of estimated depth are for a keypoint noise of 1 / _PIXELS_OF_SIGMA pixels
 _PIXELS_OF_SIGMA = 3.0
-# the four depths around a keypoint may differ by this share of the smallest; beyond, it lies on an
-# edge and has no depth
+# if the four depths around a keypoint differ by more than this share of the smallest, the keypoint
+# is on an edge and has no depth
 MAX_DEPTH_JUMP = 0.1
-# noise of keypoints, and of poses as seen in the images, which makes points uncertain: with the
-# sensor's noise alone half the points would go (docs/experiments/map-refinement.md)
+# noise of triangulated points, from keypoints and map poses: with the sensor's noise alone, half
+# the points would be rejected (docs/experiments/map-refinement.md)
 _KEYPOINT_NOISE_PX = 2.0
-# a point agrees with any depth this near: allows for edges and registration of image and depth
+# a point may match any depth within this many pixels: allows for edges and for misregistration of
+# image and depth
 _WINDOW_PX = 3
-_SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
+_SAME_CENTRE_M = 1e-9  # smaller offsets are rounding of composed transforms
 
 
 def lift_keypoints(
@@ -46,9 +48,9 @@ def lift_keypoints(
     depth_camera: Camera,
     image_from_depth: RigidTransform,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Lift an image's keypoints (N, 2 or more) by a depth map of the same moment.
+    """Lift an image's keypoints (N, 2 or more) to 3D with a depth map taken at the same time.
 
-    Depth is interpolated between four pixels; if some are unknown, the nearest known one counts.
+    Depth is interpolated between four pixels. If some are unknown, the nearest known one is used.
 
     Parameters
     ----------
@@ -57,7 +59,7 @@ def lift_keypoints(
 
     Returns
     -------
-    Points float64 (N, 3) in the image camera's frame, NaN without depth, and a mask (N,).
+    Points float64 (N, 3) in the image camera's frame, NaN without depth, and a validity mask (N,).
     """
     rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
     depth_from_image = image_from_depth.inverse()
@@ -65,7 +67,7 @@ def lift_keypoints(
     if not len(rays) or not (depth_m > 0).any():
         return points, np.zeros(len(rays), bool)
     same_centre = bool(np.linalg.norm(image_from_depth.translation) < _SAME_CENTRE_M)
-    # with one centre, all points of a ray are at one pixel
+    # if both cameras have the same centre, a ray projects to one pixel of the depth map
     z = np.full(len(rays), 1.0 if same_centre else float(np.median(depth_m[depth_m > 0])))
     settled = np.zeros(len(rays), bool)
     for _ in range(1 if same_centre else _ROUNDS):
@@ -89,11 +91,11 @@ def lift_with_covariances(
     image_camera: Camera,
     depth_camera: Camera,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Lift keypoints by a depth map of the image's own centre, with covariances (N, 3, 3).
+    """Lift keypoints with a depth map that has the image's centre; also return covariances.
 
-    ``sigma_m`` float32 (H, W) are the deviations of depth, 0 where unknown, taken as those for a
-    keypoint noise of a third of a pixel (the pose's ``map_noise``). Covariances are for a noise of
-    1 px, in the camera's frame.
+    ``sigma_m`` float32 (H, W) are the standard deviations of depth for a keypoint noise of a third
+    of a pixel (the pose's ``map_noise``), 0 where unknown. Returns points (N, 3) in the camera's
+    frame, their covariances (N, 3, 3) for a keypoint noise of 1 px, and a validity mask (N,).
     """
     same = RigidTransform.identity()
     points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same)
@@ -117,8 +119,8 @@ def sample_depth(
 ) -> Floats:
     """Return interpolated depths (N,) at pixels (N, 2), see :func:`lift_keypoints`.
 
-    NaN outside the map, where depth is unknown, and where it jumps; ``whole`` requires all four
-    pixels.
+    Depths are NaN outside the map, where depth is unknown, and where neighbours differ by more than
+    ``max_jump`` times the smallest. ``whole`` requires all four neighbours to be known.
     """
     height, width = depth_m.shape
     result = np.full(len(pixels), np.nan)
@@ -146,10 +148,10 @@ def sample_depth(
 
 
 class DepthVerificationOptions(Options):
-    """Options of depth verification: noise of the sensor and largest distance.
+    """Options of depth verification.
 
-    The default noise is a structured-light sensor's: 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et al.,
-    3DIMPVT 2012, eq. 4). A laser scan has about ``[0.003, 0, 0]``.
+    The default noise is that of a structured-light sensor: 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et
+    al., 3DIMPVT 2012, eq. 4). For a laser scan use about ``[0.003, 0, 0]``.
     """
 
     max_sigmas: float | None = Field(
@@ -167,7 +169,7 @@ class DepthVerificationOptions(Options):
     @classmethod
     def _positive(cls, noise: tuple[float, float, float]) -> tuple[float, float, float]:
         a, b, c = noise
-        # minimum at z = -b / 2c, if positive, else at 0
+        # the parabola's minimum is at z = -b / 2c if that is positive, else at 0
         lowest = a - b * b / (4.0 * c) if c > 0 and b < 0 else a
         if not np.isfinite(noise).all() or lowest <= 0 or c < 0 or (c == 0 and b < 0):
             raise ValueError("noise is not positive at every depth")
@@ -185,8 +187,9 @@ def contradicted_by_depth(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Find the points (N, 3), in the image camera's frame, that are off the surface of a depth map.
 
-    ``deviations`` (N,) are the points' along the depth camera's axis for a noise of 1 px, NaN if
-    unknown. Returns masks (N,) of contradicted points and of points with depth to compare with.
+    ``deviations`` (N,) are the points' standard deviations along the depth camera's axis for a
+    keypoint noise of 1 px, NaN if unknown. Returns masks (N,): points off the surface, and points
+    that have depth to compare with.
     """
     sigmas = 0.0 if deviations is None else np.nan_to_num(deviations) * _KEYPOINT_NOISE_PX
     before, behind, checked = compare_with_depth(
@@ -203,9 +206,10 @@ def compare_with_depth(
     options: DepthVerificationOptions,
     sigmas: Floats | float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Compare points, with standard deviations ``sigmas``, with the surface of a depth map.
+    """Compare points (N, 3), in the image camera's frame, with the surface of a depth map.
 
-    Returns masks (N,): before the surface, behind it, and with depth to compare with.
+    ``sigmas`` are the points' standard deviations along the depth camera's axis. Returns masks
+    (N,): points in front of the surface, behind it, and points that have depth to compare with.
     """
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
     before, behind, checked = np.zeros((3, len(points)), bool)
@@ -222,7 +226,7 @@ def compare_with_depth(
     lines = np.clip(line[:, None, None] + reach[None, :, None], 0, height - 1)
     window = depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)
     known = np.isfinite(window) & (window > 0)
-    # next to a hole, the surface may be invisible to the sensor
+    # next to a hole, the sensor may have missed the surface
     whole = known.all(axis=1)
     rows, window = rows[whole], window[whole]
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)

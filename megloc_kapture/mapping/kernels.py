@@ -14,7 +14,7 @@ from numba import get_num_threads
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.projection import PINHOLES, distorted
 
-# least ratio of the information's pivots that determine a point
+# a point is undetermined if the pivots of its information matrix have a smaller ratio
 _MIN_RATIO = 1e-13
 
 
@@ -25,7 +25,7 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
         for first, last in chunks:
             work(first, last)
         return
-    with ThreadPoolExecutor(get_num_threads()) as executor:  # cores open to the process
+    with ThreadPoolExecutor(get_num_threads()) as executor:  # one per available core
         for done in [executor.submit(work, first, last) for first, last in chunks]:
             done.result()
 
@@ -34,8 +34,7 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
 def most_shared(
     first, last, starts, of_image, images, track, track_starts, window, min_shared, best
 ):
-    """Find the images that share most points with images ``first`` to ``last``: rows of ``best``
-    (I, K).
+    """Fill rows ``first`` to ``last`` of ``best`` (I, K) with the images that share most points.
 
     Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations are sorted by
     track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``. At most

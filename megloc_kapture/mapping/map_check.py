@@ -1,7 +1,7 @@
 """Checks of a prebuilt map: its pixel origin, and its consistency.
 
-COLMAP's pixel origin is the corner of the first pixel, that of many networks and simulators its
-centre. An offset between keypoints and intrinsics shows in the reprojection error. Otherwise
+COLMAP's pixel origin is the corner of the first pixel; many networks and simulators use its centre.
+If keypoints and intrinsics have different origins, the reprojection error shows it. Otherwise
 principal points at exactly ((w - 1) / 2, (h - 1) / 2) indicate the centre.
 """
 
@@ -123,8 +123,8 @@ def find_pixel_origin(
         elif centred:
             where = "and every principal point is ((w-1)/2, (h-1)/2)"
         else:
-            where = "and no principal point says otherwise"
-        fit = "keypoints and intrinsics fit each other as stored"
+            where = "and the principal points indicate no other"
+        fit = "keypoints and intrinsics have the same origin"
         reason = f"{fit if images else 'no observation to compare with'}, {where}"
     shift_of_keypoints = _HALF if keypoints == "centre" else 0.0
     by_origin: dict[Origin, float] = {
@@ -146,14 +146,14 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
         if not np.isfinite(image.keypoints_px).all():
             return f"keypoints of {image.name} are not finite"
         if reason := camera_fault(image.camera):
-            return f"the camera of {image.name} cannot be: {reason}"
+            return f"the camera of {image.name} is impossible: {reason}"
     observed = [image for image in images if len(image.rows)]
     if not observed:
         return None
     poses = (image.cam_from_world for image in images)
     rounded = {tuple(round(v, 9) for v in (*p.quat_wxyz, *p.translation)) for p in poses}
     if len(images) > 2 and len(rounded) == 1:
-        return f"all of {len(images)} images have one pose"
+        return f"all {len(images)} images have the same pose"
     errors = _median_errors_px(observed, xyz)
     sides = (max(image.camera.width, image.camera.height) for image in observed)
     limits = [max(_MIN_LIMIT_PX, _MAX_SHARE * side) for side in sides]
@@ -161,8 +161,8 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
     if failing <= _MAX_FAILING * len(observed):
         return None
     message = (
-        f"the points do not fit the keypoints: of {len(observed)} images {failing} have a median "
-        f"reprojection error above {min(limits):.3g} px, the median of all is "
+        f"the points do not fit the keypoints: {failing} of {len(observed)} images have a median "
+        f"reprojection error above {min(limits):.3g} px; the median over all images is "
         f"{float(np.median(errors)):.3g} px"
     )
     best, error = _likely_mistake(observed, xyz)
@@ -185,7 +185,7 @@ def camera_fault(camera: Camera) -> str | None:
     pixels = halfway * (camera.width, camera.height)
     rays = normalized_from_px(camera, pixels)
     if not np.isfinite(rays).all():
-        return "its distortion cannot be undone halfway to the image's border"
+        return "its distortion is not invertible halfway to the image's border"
     flat = (pixels - (cx, cy)) / focal
     lengths, straight = np.linalg.norm(rays, axis=1), np.linalg.norm(flat, axis=1)
     ratios = lengths[straight > 0.02] / straight[straight > 0.02]
@@ -202,11 +202,11 @@ def _median_errors_px(images: Iterable[ObservedKeypoints], xyz: Floats) -> Float
 
 
 def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[str, float]:
-    """Return the reading of the map with the smallest error, and its median error."""
+    """Return the interpretation of the map with the smallest error, and its median error."""
     best = ("", np.inf)
     for name, read in _readings(images, xyz):
         error = float(np.median(_median_errors_px(map(read, images), xyz)))
-        # the first of similar ones, which is the simplest
+        # of similar errors take the first, which is the simplest interpretation
         if error < 0.9 * best[1]:
             best = (name, error)
     return best
@@ -215,7 +215,7 @@ def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[s
 def _readings(
     images: Sequence[ObservedKeypoints], xyz: Floats
 ) -> Iterator[tuple[str, Callable[[ObservedKeypoints], ObservedKeypoints]]]:
-    """Yield other readings of a map."""
+    """Yield other interpretations of a map."""
     yield (
         "keypoints read as (y, x)",
         lambda image: replace(image, keypoints_px=image.keypoints_px[:, ::-1]),
@@ -244,7 +244,7 @@ def _with_convention(
 
 
 def _factors(images: Sequence[ObservedKeypoints], xyz: Floats) -> dict[str, float]:
-    """Return the scale factors of keypoints and focal length that would fit."""
+    """Return the scale factors of keypoints and of focal length that fit best."""
     of_keypoints, of_focal = [], []
     for image in images:
         pixels = image.keypoints_px[image.rows].astype(np.float64)

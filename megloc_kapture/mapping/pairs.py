@@ -14,12 +14,12 @@ from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 _BLOCK_ELEMENTS = 1 << 20  # distances held at once, about 80 bytes each
-# most neighbours searched for similar viewing directions
+# largest number of neighbours searched for similar viewing directions
 _MAX_SEARCHED = 1024
-# images before and after in a track that count as sharing its point
+# in a track, an image shares the point with this many images before and after it
 _TRACK_WINDOW = 512
 _IMAGES_AT_ONCE = 256
-# pixels across and down; depths in distances of the two centres
+# tested points: number of pixels across and down, and depths as multiples of the baseline
 _GRID = (9, 7)
 _DEPTHS = 2.0 ** np.arange(-2, 8, 0.5)
 
@@ -32,20 +32,20 @@ def exhaustive_pairs(count: int) -> NDArray[np.int64]:
 def unique_pairs(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return distinct pairs (P, 2) with i < j, sorted."""
     low, high = pairs.min(axis=1), pairs.max(axis=1)
-    # a pair as one number sorts faster
+    # sorting is faster if a pair is one number
     base = int(high.max(initial=0)) + 1
     keys = each_once((low * base + high)[low != high])
     return np.stack(np.divmod(keys, base), axis=1)
 
 
 def each_once(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return distinct keys (K,), sorted; ten times as fast as np.unique."""
+    """Return the sorted distinct keys (K,), ten times as fast as np.unique."""
     ascending = np.sort(keys)
     return ascending[np.append(True, ascending[1:] != ascending[:-1])[: len(keys)]]
 
 
 class PairsByPosesOptions(Options):
-    """Options of pairs by poses; neighbours are counted, so no metric scale is needed."""
+    """Options of pairs by poses, which need no metric scale since neighbours are counted."""
 
     num_neighbours: int = Field(
         default=20, gt=0, description="number of nearest camera centres per image"
@@ -60,7 +60,7 @@ def pairs_by_poses(
 ) -> NDArray[np.int64]:
     """Return pairs (P, 2) of nearby images with similar viewing directions, i < j, sorted.
 
-    Searches growing neighbourhoods of a k-d tree, at most the 1024 nearest centres.
+    It searches growing neighbourhoods in a k-d tree, up to the 1024 nearest centres.
     """
     options = options or PairsByPosesOptions()
     count = len(cams_from_world)
@@ -72,7 +72,7 @@ def pairs_by_poses(
     tree = cKDTree(centers)
     parts = [np.zeros((0, 2), dtype=np.int64)]
     waiting = np.arange(count)
-    # an image is its own nearest centre
+    # plus one, as an image is its own nearest neighbour
     largest = min(count, max(_MAX_SEARCHED, options.num_neighbours) + 1)
     size = min(largest, 4 * options.num_neighbours + 1)
     while len(waiting):
@@ -85,7 +85,7 @@ def pairs_by_poses(
             cosine = np.einsum("nd,nkd->nk", axes[part], axes[index])
             good = valid & (cosine >= min_cosine - 1e-12)
             rank = np.cumsum(good, axis=1)
-            # an image whose neighbours look elsewhere searches further
+            # if neighbours have other viewing directions, search more of them
             done = (rank[:, -1] >= options.num_neighbours) | (size >= largest)
             take = good & (rank <= options.num_neighbours) & done[:, None]
             rows, columns = np.nonzero(take)
@@ -96,7 +96,7 @@ def pairs_by_poses(
     return unique_pairs(np.concatenate(parts))
 
 
-# points both images observe: as many as the matches of a verified pair
+# smallest number of shared points, equal to the number of matches of a verified pair
 _MIN_SHARED_POINTS = 15
 
 
@@ -112,8 +112,8 @@ def pairs_by_covisibility(
 ) -> NDArray[np.int64]:
     """Pair each image with those that share most points; int64 (P, 2), i < j, sorted.
 
-    Observations (O,) are in any order. In longer tracks, only the 512 images before and after
-    count.
+    Observations (O,) are in any order. In longer tracks, an image shares the point only with the
+    512 images before and after it.
     """
     from megloc_kapture.mapping import kernels
 
@@ -148,7 +148,7 @@ class PairsBySequenceOptions(Options):
 def pairs_by_sequence(
     cameras: Sequence[str], timestamps: Sequence[int], options: PairsBySequenceOptions
 ) -> NDArray[np.int64]:
-    """Pair each image with the next ones of its camera; (P, 2), i < j, sorted."""
+    """Pair each image with the next images of its camera; int64 (P, 2), i < j, sorted."""
     sequences: dict[str, list[int]] = {}
     for image in sorted(range(len(cameras)), key=lambda image: timestamps[image]):
         sequences.setdefault(cameras[image], []).append(image)
@@ -170,7 +170,8 @@ def views_can_overlap(
 ) -> bool:
     """Return True if a point in one camera's view may be in the other's.
 
-    Tested along rays of a pixel grid, from a quarter of the cameras' distance to infinity.
+    The test points are on rays of a pixel grid, at depths from a quarter of the baseline to
+    infinity.
     """
     between = second_from_world @ first_from_world.inverse()
     return _reaches(first, second, between) or _reaches(second, first, between.inverse())
@@ -184,7 +185,7 @@ def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -
     turned = rays @ second_from_first.rotation_matrix().T
     offset = np.asarray(second_from_first.translation)
     depths = _DEPTHS * np.linalg.norm(offset)
-    # at infinity only the rotation counts
+    # the rays themselves are points at infinity, where only the rotation matters
     points = [turned, *(turned * depth + offset for depth in depths[depths > 0])]
     with np.errstate(invalid="ignore"):
         seen = px_from_cam(second, np.concatenate(points))

@@ -1,10 +1,10 @@
 """Covariances of map points, and rejection of uncertain points.
 
 MegLoc, section "Mapping": with ``p_c = R_cw p_w + t_cw`` and the projection ``pi``, an observation
-has the Jacobian ``J = d pi / d p_c  R_cw`` (the equation as printed has a malformed middle term,
-and ``R_wc`` for ``R_cw``), with poses and cameras fixed. For independent noise of one pixel a
-point's covariance is the inverse of ``sum J^T J``; the roots of its eigenvalues are deviations
-along orthogonal axes. ``d pi / d p_c`` includes the camera's distortion.
+has the Jacobian ``J = d pi / d p_c  R_cw`` with poses and cameras fixed (the printed equation has a
+malformed middle term, and ``R_wc`` instead of ``R_cw``). For independent noise of one pixel, a
+point's covariance is the inverse of ``sum J^T J``; the roots of its eigenvalues are standard
+deviations along orthogonal axes. ``d pi / d p_c`` includes the camera's distortion.
 """
 
 from __future__ import annotations

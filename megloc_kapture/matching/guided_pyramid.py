@@ -2,12 +2,13 @@
 
 MegLoc, section "Guided pyramid matching": for pairs with fewer than 100 matches, features of scaled
 and rotated variants of one image are matched with the other image. All matches are combined
-(``all``), or the richest variant's are kept (``max``). The paper counts the matcher's matches;
-counting verified ones suits any matcher.
+(``all``), or those of the variant with the most matches are kept (``max``). The paper counts the
+matcher's matches; counting verified matches suits any matcher.
 
-Each variant is verified separately: most are rotated wrongly, and their random matches would drown
-a common two-view model. Without known poses a few random matches fit some model, so all variants
-must agree with the model of the richest. Only matched keypoints are added to an image.
+Each variant is verified separately: most have the wrong rotation, and their random matches would
+outnumber the inliers of a common two-view model. Without known poses a few random matches fit some
+model, so all variants must agree with the model of the variant with the most matches. Only matched
+keypoints are added to an image.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.values import ImageFeatures, LocalFeatures, Options
 
 _SUFFIX = "-pyramid"
-# least ratio of a reduced enlargement to the next smaller scale
+# a scale limited by _MAX_SIDE_PX is omitted below this ratio to the next smaller scale
 _MIN_STEP = 1.2
 
 Extract = Callable[[NDArray[np.uint8], NDArray[np.bool_] | None], LocalFeatures]
@@ -36,10 +37,10 @@ Match = Callable[[ImageFeatures, Sequence[ImageFeatures]], Sequence[PairMatches]
 
 @dataclass(frozen=True, order=True)
 class ImageVariant:
-    """An image scaled, then rotated counter-clockwise by quarters.
+    """An image scaled, then rotated counter-clockwise by multiples of 90 degrees.
 
-    A variant covers the same scene from edge to edge: pixel coordinates, the first centre at (0.5,
-    0.5), scale by the ratio of the rounded sizes.
+    A variant covers the image from edge to edge, so pixel coordinates scale by the ratio of the
+    rounded sizes. The first pixel's centre is (0.5, 0.5).
     """
 
     scale: float = 1.0
@@ -128,7 +129,7 @@ class GuidedPyramidOptions(Options):
     )
     count: Literal["matches", "verified"] = Field(
         default="verified",
-        description="matches that min_matches counts: all of the matcher's, or the verified ones",
+        description="matches that min_matches counts: all matches, or the verified ones",
     )
     scales: tuple[float, ...] = Field(
         default=(1 / 3, 0.5, 1.0, 2.0, 3.0),
@@ -175,7 +176,7 @@ class GuidedPyramidOptions(Options):
 
 
 def pyramid_type(local_type: str) -> str:
-    """Return the type of keypoints that begin with those of a type, followed by the added ones."""
+    """Return the keypoints type whose keypoints are those of a type, followed by added ones."""
     return local_type + _SUFFIX
 
 
@@ -185,7 +186,7 @@ def base_type(local_type: str) -> str:
 
 
 def equivalent_types(local_type: str) -> tuple[str, ...]:
-    """Return the types whose query features serve matches of a type, best first."""
+    """Return the types whose query features can be matched with a type, best first."""
     base = base_type(local_type)
     return tuple(dict.fromkeys((local_type, base, pyramid_type(base))))
 
@@ -288,8 +289,8 @@ def extract_variants(
         values = like.descriptors.shape[1]
         if px.shape[1] < columns or features.descriptors.shape[1] != values:
             raise DataError(
-                f"the image's features have {columns} numbers per keypoint and {values} per "
-                f"descriptor, the extractor's {px.shape[1]} and {features.descriptors.shape[1]}"
+                f"expected {columns} numbers per keypoint and {values} per descriptor, but the "
+                f"extractor returns {px.shape[1]} and {features.descriptors.shape[1]}"
             )
         size = variant.size(width, height)
         in_variant = ImageFeatures(px[:, :columns], features.descriptors, *size)

@@ -1,4 +1,4 @@
-"""Exact mutual nearest neighbours of local descriptors, by one blocked matrix product."""
+"""Exact mutual nearest neighbours of local descriptors, by blocked matrix products."""
 
 from __future__ import annotations
 
@@ -72,10 +72,9 @@ def match_nearest(
 def _search(
     a: NDArray[np.float32], b: NDArray[np.float32], *, mutual: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Return each row's best column and its value, each column's best value, and second-best
-    columns.
+    """Return each row's best column and value, each column's best value, and the second best.
 
-    With ``mutual``, the second best only of rows that can still be mutual.
+    With ``mutual``, the second best is found only for rows that can still be mutual.
     """
     best = np.empty(len(a), dtype=np.int64)
     similarity = np.empty(len(a), dtype=np.float32)

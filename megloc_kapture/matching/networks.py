@@ -35,7 +35,7 @@ PairOptions = TypeVar("PairOptions", bound=NetworkOptions)
 
 class PairNetwork(Checkpointed[PairOptions], ABC):
     def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
-        """Match two images: int64 (K, 2), sorted by a, keypoints unique; scores float32 (K,)."""
+        """Match two images; return rows int64 (K, 2), unique and sorted by a, and scores (K,)."""
         return self.match_many(a, [b])[0]
 
     @abstractmethod
@@ -55,7 +55,7 @@ def _matched(
 
 
 class SuperGlueOptions(NetworkOptions):
-    """Options of SuperGlue; threshold and iterations are the authors'."""
+    """Options of SuperGlue; threshold and iterations default to the authors' values."""
 
     weights: str = Field(
         default="superglue_outdoor",
@@ -90,28 +90,29 @@ class SuperGlue(PairNetwork[SuperGlueOptions]):
 def network_input(
     image: ImageFeatures, descriptor_size: int, where: str, device: torch.device
 ) -> ImageKeypoints:
-    """Convert an image's features for SuperGlue; DataError without scores in (0, 1], or for
-    descriptors of another size. ``where`` names the weights.
+    """Convert an image's features for SuperGlue; ``where`` names the weights.
+
+    Raises DataError without scores in (0, 1], or for descriptors of another size.
     """
     table = np.asarray(image.keypoints_px, dtype=np.float32)
     descriptors = np.asarray(image.descriptors, dtype=np.float32)
     if table.ndim != 2 or table.shape[1] < 3:
         raise DataError(
-            f"SuperGlue takes keypoints of x, y, score; these have the shape {table.shape}"
+            f"SuperGlue needs keypoints (N, 3) of x, y, score; these have the shape {table.shape}"
         )
     scores = table[:, 2]
     if not ((scores > 0) & (scores <= 1)).all():
         worst = scores[~((scores > 0) & (scores <= 1))][0]
         raise DataError(
-            "SuperGlue takes the detector's score as third column of the keypoints, above 0 "
-            f"and up to 1; this one has {worst:g}"
+            "SuperGlue needs the detector's score as third column of the keypoints, above 0 "
+            f"and at most 1; a keypoint has {worst:g}"
         )
     if len(table) and descriptors.shape != (len(table), descriptor_size):
         raise DataError(
-            f"{where} takes descriptors of {descriptor_size} dimensions, one "
+            f"{where} needs descriptors of {descriptor_size} dimensions, one "
             f"for each of {len(table)} keypoints; these have the shape {descriptors.shape}"
         )
-    # the network's first pixel centre is (0, 0)
+    # in the network, the first pixel's centre is (0, 0)
     xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(device)
     return ImageKeypoints(
         normalise_keypoints(xy, image.width, image.height),
@@ -169,7 +170,7 @@ class LightGlue(PairNetwork[LightGlueOptions]):
 def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
     if len(image.descriptors) and image.descriptors.shape[1] != expected:
         raise DataError(
-            f"these weights match descriptors of {expected} values, the features' have "
+            f"these weights match descriptors of {expected} dimensions, but the features have "
             f"{image.descriptors.shape[1]}",
             path=file.path,
         )
@@ -178,8 +179,8 @@ def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
 def _kornia_input(image: ImageFeatures, device: torch.device) -> dict[str, torch.Tensor]:
     """Return keypoints, descriptors and size of an image with a leading axis of length 1.
 
-    The networks' first pixel centre is (0, 0); keypoints are clamped, since kornia rejects negative
-    ones.
+    In the networks, the first pixel's centre is (0, 0). Keypoints are clamped, since kornia rejects
+    negative coordinates.
     """
     xy = image.keypoints_px[:, :2].astype(np.float32) - np.float32(0.5)
     size = np.array([image.width, image.height], np.float32)
@@ -193,10 +194,10 @@ class LighterGlueOptions(LightGlueOptions):
 
     weights: str = Field(default="xfeat-lighterglue", description="name in the registry, or a file")
     depth_confidence: float = Field(
-        default=-1.0, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
+        default=-1.0, ge=-1, le=1, description="stop early at this confidence; -1: run all layers"
     )
     width_confidence: float = Field(
-        default=0.95, ge=-1, le=1, description="drop keypoints at this confidence; -1: none"
+        default=0.95, ge=-1, le=1, description="drop keypoints at this confidence; -1: keep all"
     )
 
 

@@ -13,17 +13,19 @@ from megloc_kapture.geometry.poses import CONVENTIONS, better_conventions
 from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
 from megloc_kapture.values import RigidTransform
 
-# share of the larger side, more than a degree: poses of depth sensors have such errors
+# largest Sampson distance as a share of the larger side, more than a degree: poses of depth sensors
+# have such errors
 _MAX_ERROR_SHARE = 0.02
-_AGREEING = 0.5  # least share of a pair's matches that fit its poses
+_AGREEING = 0.5  # the poses of a pair are right if this share of its matches fits them
 _MOST = 0.5
-_FEW = 3  # least compared images to reject a map
+_FEW = 3  # a map is rejected only if at least this many images are compared
 
 
 @dataclass(frozen=True)
 class PairEvidence:
-    """Number of verified matches of a pair, and of those that fit the poses as given and in each of
-    :data:`CONVENTIONS`.
+    """Number of verified matches of a pair, and numbers of those that fit its poses.
+
+    The latter are for the poses as given, then for :data:`CONVENTIONS`.
     """
 
     image: str
@@ -60,16 +62,16 @@ def count_fitting(
 
 
 def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None:
-    """Return the contradiction and True if it concerns most images; None without one."""
+    """Return a message, and True if it concerns most images; None without a contradiction."""
     if not pairs:
         return None
     total = sum(pair.num for pair in pairs)
     counts: NDArray[np.int64] = np.sum([pair.fitting for pair in pairs], axis=0)
     if better := better_conventions((counts / total).tolist()):
         message = (
-            f"the given poses contradict the matches: of {total} matches in {len(pairs)} image "
-            f"pairs {counts[0]} fit the poses; {' or '.join(better)}, {counts[1:].max()} would "
-            "fit. Convert the poses to cam_from_world with x right, y down, z forward"
+            f"the given poses contradict the matches: {counts[0]} of {total} matches in "
+            f"{len(pairs)} image pairs fit them; with {' or '.join(better)}, {counts[1:].max()} "
+            "would. Convert the poses to cam_from_world with x right, y down, z forward"
         )
         return message, True
     wrong, right = _split(pairs)
@@ -88,8 +90,8 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
 def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
     """Return the images with contradicting poses, and the number of images with an agreeing pair.
 
-    A wrong pose spoils the pairs of right images too, so the worst image is removed first,
-    repeatedly. A single pair is no evidence against an image.
+    A wrong pose also affects the pairs of images with right poses, so the worst image is removed
+    first, repeatedly. A single pair is no evidence against an image.
     """
     number = Counter(image for pair in pairs for image in (pair.image, pair.other))
     wrong: list[str] = []

@@ -1,7 +1,7 @@
-"""Combination of the matches of a pair and its variants, and their added keypoints.
+"""Combination of the matches of a pair and of its variants, and of their keypoints.
 
-MegLoc, section "Guided pyramid matching": ALL is the union, MAX the richest. A keypoint has at most
-one match per other image.
+MegLoc, section "Guided pyramid matching": ALL is the union of the matches, MAX the matches of the
+variant that has most. A keypoint has at most one match per other image.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Combined:
     Attributes
     ----------
     matches, scores : int64 (K, 2) and float64 (K,).
-    best : tried variant with most matches; None if the images themselves have as many.
-    added : per image, variant and match index of each appended keypoint, int64 (A, 2).
+    best : variant with most matches; None if it has no more than the images themselves.
+    added : per image int64 (A, 2), variant and match index of each appended keypoint.
     """
 
     matches: NDArray[np.int64]
@@ -51,9 +51,10 @@ def combine(
 ) -> Combined:
     """Combine the matches of a pair and its variants, and append their keypoints.
 
-    The base matches (K, 2) come first, then the variants', richest first and best matches first;
-    matches of used keypoints are skipped. With ``max`` the richest variant replaces the base if it
-    has more. The second image's keypoints may be None without variants of it.
+    The base matches (K, 2) come first. The variants follow by number of matches, their matches by
+    score; matches of used keypoints are skipped. With ``max``, the variant with most matches
+    replaces the base if it has more. The second image's keypoints may be None if it has no
+    variants.
     """
     base_matches, base_scores = base
     order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))
@@ -65,7 +66,7 @@ def combine(
             alone.take(best, tried[best])
             if len(alone.matches) > len(base_matches):
                 return alone.result(best)
-            # identical keypoints have reduced its matches
+            # merging identical keypoints has removed some of its matches
             for union, length in zip(keypoints, lengths, strict=True):
                 if union is not None:
                     union.truncate(length)
@@ -90,11 +91,11 @@ class _Combination:
         self._added: tuple[list[tuple[int, int]], list[tuple[int, int]]] = ([], [])
 
     def take(self, number: int, tried: TriedVariant) -> None:
-        """Add the matches of a variant between unused keypoints."""
+        """Add those matches of a variant that join unused keypoints."""
         side, matched = tried
         union = self._keypoints[side]
         if union is None:
-            raise ValueError("a variant of an image whose keypoints are not given")
+            raise ValueError("keypoints are missing for an image with variants")
         known = union.find(matched.keypoints_px)
         used, used_other = self._used[side], self._used[1 - side]
         for k in np.argsort(-matched.scores, kind="stable").tolist():
@@ -102,7 +103,7 @@ class _Combination:
             if other in used_other:
                 continue
             row = int(known[k])
-            if row < 0:  # may have been appended in this loop
+            if row < 0:  # the keypoint may have been appended in this loop
                 row = union.find_added(matched.keypoints_px[k])
             if row < 0:
                 row = union.append(matched.keypoints_px[k])
@@ -127,7 +128,7 @@ class _Combination:
 class KeypointUnion:
     """Base keypoints float32 (N, C), followed by added ones.
 
-    A keypoint within a pixel of an existing one is identified with the nearest such keypoint.
+    A keypoint within a pixel of existing keypoints is identical to the nearest of them.
     """
 
     def __init__(self, base: Float32, added: Float32 | None = None) -> None:
@@ -142,7 +143,7 @@ class KeypointUnion:
         return len(self._base) + len(self._added)
 
     def find(self, keypoints_px: Float32) -> NDArray[np.int64]:
-        """Return the rows (K,) of the identical keypoints, -1 if missing."""
+        """Return the rows (K,) of identical keypoints, -1 for new ones."""
         rows_of = np.full(len(keypoints_px), -1, dtype=np.int64)
         if self._tree is not None and len(keypoints_px):
             near = self._tree.query_ball_point(
@@ -156,7 +157,7 @@ class KeypointUnion:
         return rows_of
 
     def find_added(self, keypoint_px: Float32) -> int:
-        """Find one keypoint (C,) among the added ones, see :meth:`find`."""
+        """Return the row of an identical added keypoint (C,), see :meth:`find`."""
         x, y = _cell(keypoint_px)
         rows = [
             row

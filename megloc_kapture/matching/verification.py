@@ -29,11 +29,11 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-_MAX_RAY_ERROR_PX = 0.1  # round trip of a pixel
-_MIN_AGREEING = 0.5  # share of a variant's matches
+_MAX_RAY_ERROR_PX = 0.1  # largest error of a pixel converted to a ray and back
+_MIN_AGREEING = 0.5  # smallest share of a variant's matches that agree with the model
 _SAMPLE = 5  # matches that determine a relative pose
-_THRESHOLDS = (1.0, 0.5, 0.25)  # shares of the error threshold, of which the best counts
-# strict, since matches on one object are not independent
+_THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best one counts
+# this limit is strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
 _MAX_WRONG_PAIRS = 20_000
 # a pair with fewer verified matches counts as not overlapping
@@ -56,7 +56,9 @@ class TwoViewOptions(Options):
         default=4.0, gt=0, description="largest distance of an inlier from its epipolar line"
     )
     max_iterations: int = Field(
-        default=100, gt=0, description="of RANSAC; use more for matchers with uninformative scores"
+        default=100,
+        gt=0,
+        description="RANSAC iterations; use more for matchers with uninformative scores",
     )
 
 
@@ -68,8 +70,8 @@ def essential_matrix(b_from_a: RigidTransform) -> Floats:
 def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Floats) -> Floats:
     """Return derivatives d (x, y) / d px (N, 2, 2) of rays (N, 3) by their pixels (N, 2).
 
-    NaN where the ray does not project to its pixel: distortion without inverse, or sideways rays of
-    a fisheye.
+    NaN where the ray does not project to its pixel: the distortion has no inverse, or the ray of a
+    fisheye camera is sideways.
     """
     from megloc_kapture.geometry.projection import project_with_jacobian
 
@@ -77,7 +79,7 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
     a, b, c, d = (jacobian[:, row, column] for row in (0, 1) for column in (0, 1))
     determinant = a * d - b * c
     error = np.abs(px - keypoints_px).max(axis=1)
-    # a distortion polynomial that turns back mirrors
+    # reject mirrored pixels, where a distortion polynomial folds over
     good = (error <= _MAX_RAY_ERROR_PX) & (determinant > 0)
     slopes = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
     slopes /= np.where(good, determinant, np.nan)[:, None, None]
@@ -131,8 +133,8 @@ def verify_with_poses(
 ) -> NDArray[np.bool_]:
     """Return a mask (N,) of the matched rays (N, 3) that agree with a relative pose.
 
-    ``slopes`` see :func:`ray_slopes`, NaN is rejected. All False if fewer than ``min_matches``
-    agree.
+    Matches with NaN ``slopes`` (:func:`ray_slopes`) are rejected. All are False if fewer than
+    ``min_matches`` agree.
     """
     options = options or KnownPoseOptions()
     if len(rays_a) == 0:
@@ -184,7 +186,7 @@ def two_view_of_variants(
     base_matches: NDArray[np.int64],
     options: TwoViewOptions,
 ) -> PairVerifier:
-    """Return a two-view verifier; variants must agree with the model of the richest.
+    """Return a two-view verifier; variants must agree with the model of the best variant.
 
     Keypoints are (N, 2 or more) and (M, 2 or more); ``base_matches`` int64 (K, 2) are the verified
     matches of the images themselves.
@@ -252,8 +254,9 @@ def known_pose_of_variants(
     other_from_image: RigidTransform,
     options: KnownPoseOptions,
 ) -> PairVerifier:
-    """Return a verifier by a known pose; the other image's rays (M, 3) and slopes (M, 2, 2) are
-    given.
+    """Return a verifier by a known pose.
+
+    ``other_rays`` (M, 3) and ``other_slopes`` (M, 2, 2) are those of the other image's keypoints.
     """
 
     def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:

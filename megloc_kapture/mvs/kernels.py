@@ -19,7 +19,7 @@ _FLAT = np.float32(1e-6)
 
 @compiled_loop
 def window_sums(image, other, radius, row, columns, sums):
-    """Sum image, image^2 and image * other over windows of a row into float32 (3, W)."""
+    """Write sums of image, image^2 and image * other over a row's windows to float32 (3, W)."""
     height, width = image.shape
     for x in range(width):
         columns[0, x] = columns[1, x] = columns[2, x] = np.float32(0)
@@ -47,8 +47,8 @@ def window_sums(image, other, radius, row, columns, sums):
 def correlate(reference, warped, radius, costs):
     """Compute the matching cost under one plane: 1 - the mean of the two best correlations.
 
-    ``warped``: float32 (S, H, W), the sources warped by the plane. ``costs``: uint8 (H, W), filled
-    with 255 (1 - ZNCC), at most 255, also where invisible.
+    ``warped`` float32 (S, H, W) are the sources warped by the plane. ``costs`` uint8 (H, W) is
+    filled with 255 (1 - ZNCC), at most 255, which also marks pixels that no source sees.
     """
     height, width = reference.shape
     num_sources = len(warped)
@@ -82,9 +82,9 @@ def correlate(reference, warped, radius, costs):
 
 @compiled_loop
 def add_path(cost, grey, p1, p2, edge, dy, dx, total):
-    """Add the costs of best paths along one direction to ``total`` (Hirschmueller, PAMI 2008, eq.
-    13).
+    """Add the costs of the best paths along one direction to ``total``.
 
+    Equation 13 of Hirschmueller, PAMI 2008, is
     ``L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + p1, min_k L(q, k) + p2') - min_k L(q, k)``
     with q the pixel before p by (dy, dx), and ``p2' = max(p1, p2 edge / (edge + |I(p) - I(q)|))``.
     """
@@ -127,7 +127,7 @@ def add_path(cost, grey, p1, p2, edge, dy, dx, total):
 
 @compiled_loop
 def best_labels(total, labels):
-    """Find the fractional label (H, W) of the least total, by a parabola."""
+    """Find the fractional label (H, W) of the smallest total, by a parabola."""
     height, width, depth = total.shape
     for y in range(height):
         for x in range(width):
@@ -149,7 +149,7 @@ def best_labels(total, labels):
 def count_agreeing(
     inverse, other, infinity, baseline, back_infinity, back_baseline, max_px, max_share, counts
 ):
-    """Count another view whose inverse depth (H, W) agrees in both directions, in ``counts``.
+    """Increment ``counts`` where another view's inverse depth (H, W) agrees in both directions.
 
     ``infinity`` and ``baseline`` project into the other view; ``max_px`` limits the round-trip
     error, ``max_share`` the relative depth difference.

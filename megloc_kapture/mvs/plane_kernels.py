@@ -1,7 +1,7 @@
-"""Compiled loops of stereo: PatchMatch with slanted planes, and the uncertainty of their depth.
+"""Compiled loops of multi-view stereo: PatchMatch with slanted planes, and depth uncertainty.
 
-A plane is stored as its inverse depth ``w + wx dx + wy dy`` at a pixel offset (dx, dy), which is
-exact in a pinhole image.
+A plane is stored as (w, wx, wy): its inverse depth at pixel offset (dx, dy) is
+``w + wx dx + wy dy``, which is exact in a pinhole image.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -14,12 +14,15 @@ import numpy as np
 
 from megloc_kapture.compiling import compiled_loop
 
-_FLAT = np.float32(1e-6)
+_FLAT = np.float32(1e-6)  # a window with a smaller variance has no texture
 
 
 @compiled_loop
 def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
-    """Return the weighted ZNCC of a window part in a source; -2 if less than half is visible."""
+    """Return the weighted ZNCC over the part of a window that lies inside a source image.
+
+    The result is -2 if that part has less than half of the weight.
+    """
     height, width = source.shape
     total, r, r2, s, s2, sr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     k = 0
@@ -56,7 +59,11 @@ def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
 
 @compiled_loop
 def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline):
-    """Return a window's ZNCC in one source, by a linearised homography; -2 if invisible."""
+    """Return a window's ZNCC with one source image, or -2 if it is outside or untextured there.
+
+    ``infinity`` (3, 3) is the homography of the plane at infinity, ``baseline`` (3,) the projected
+    translation. The homography of ``plane`` is linearised at the window's centre.
+    """
     w, wx, wy = plane[0], plane[1], plane[2]
     h = infinity
     px = h[0, 0] * x + h[0, 1] * y + h[0, 2] + baseline[0] * w
@@ -104,7 +111,7 @@ def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline
 
 @compiled_loop
 def _plane_cost(values, weights, reach, y, x, plane, sources, infinities, baselines):
-    """Return 1 - mean of the best scores over the sources; 2 if invisible."""
+    """Return 1 - mean of the two best scores over the sources; 2 if no source sees the window."""
     first, second = np.float32(-2), np.float32(-2)
     for s in range(len(sources)):
         score = _plane_score(
@@ -121,7 +128,11 @@ def _plane_cost(values, weights, reach, y, x, plane, sources, infinities, baseli
 
 @compiled_loop
 def _window(reference, reach, y, x, tone, values, weights):
-    """Normalise a window with bilateral weights: mean 0, deviation 1; False if flat."""
+    """Fill ``values`` and bilateral ``weights`` of a window; return False if it has no texture.
+
+    Values have weighted mean 0 and standard deviation 1. ``tone`` is the scale of the brightness
+    differences.
+    """
     height, width = reference.shape
     centre = reference[y, x]
     k, total = 0, np.float32(0)
@@ -154,8 +165,8 @@ def _window(reference, reach, y, x, tone, values, weights):
 
 
 @compiled_loop
-def _noise(y, x, turn, k):
-    state = np.uint32(y * 73856093) ^ np.uint32(x * 19349663) ^ np.uint32(turn * 83492791 + k)
+def _noise(y, x, number, k):
+    state = np.uint32(y * 73856093) ^ np.uint32(x * 19349663) ^ np.uint32(number * 83492791 + k)
     state = np.uint32((state ^ (state >> np.uint32(16))) * np.uint32(0x7FEB352D))
     state = np.uint32((state ^ (state >> np.uint32(15))) * np.uint32(0x846CA68B))
     state = np.uint32(state ^ (state >> np.uint32(16)))
@@ -164,21 +175,22 @@ def _noise(y, x, turn, k):
 
 @compiled_loop
 def refine_planes(
-    reference, sources, infinities, baselines, planes, costs, reach, tone, turn, step, limits
+    reference, sources, infinities, baselines, planes, costs, reach, tone, number, step, limits
 ):
-    """Run one pass of PatchMatch over slanted planes (H, W, 3) (Bleyer et al., BMVC 2011), in
-    place.
+    """Update planes (H, W, 3) and costs (H, W) in place by pass ``number`` of PatchMatch.
 
-    Passes alternate in direction. Candidates are the planes of two previous neighbours and three
-    random changes: depth, slope, and both at half size. ``costs`` (H, W) are computed in pass
-    ``turn`` 0; ``step`` moves a projection by about a pixel; ``limits`` bound the inverse depth.
+    Passes alternate in direction (Bleyer et al., BMVC 2011). The candidates of a pixel are the
+    planes of its two neighbours visited before, and three random perturbations of its plane: of
+    depth, of slope, and of both by half as much. Pass 0 also computes the initial costs. ``step``
+    is the change of inverse depth that moves a projection by about a pixel; ``limits`` are the
+    smallest and largest inverse depth.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2
     values, weights = np.empty(count, np.float32), np.empty(count, np.float32)
     candidate = np.empty(3, np.float64)
-    direction = 1 if turn % 2 == 0 else -1
-    size = step * 0.5**turn
+    direction = 1 if number % 2 == 0 else -1
+    size = step * 0.5**number
     for i in range(height):
         y = i if direction > 0 else height - 1 - i
         for j in range(width):
@@ -187,7 +199,7 @@ def refine_planes(
             if not _window(reference, reach, y, x, tone, values, weights):
                 costs[y, x] = np.float32(2)
                 continue
-            if turn == 0:
+            if number == 0:
                 costs[y, x] = _plane_cost(
                     values, weights, reach, y, x, current, sources, infinities, baselines
                 )
@@ -203,10 +215,10 @@ def refine_planes(
                     scale = size if k < 4 else 0.5 * size
                     candidate[0], candidate[1], candidate[2] = current[0], current[1], current[2]
                     if k != 3:
-                        candidate[0] += scale * _noise(y, x, turn, 3 * k)
+                        candidate[0] += scale * _noise(y, x, number, 3 * k)
                     if k != 2:
-                        candidate[1] += scale / reach * _noise(y, x, turn, 3 * k + 1)
-                        candidate[2] += scale / reach * _noise(y, x, turn, 3 * k + 2)
+                        candidate[1] += scale / reach * _noise(y, x, number, 3 * k + 1)
+                        candidate[2] += scale / reach * _noise(y, x, number, 3 * k + 2)
                 if candidate[0] < limits[0] or candidate[0] > limits[1]:
                     continue
                 cost = _plane_cost(
@@ -221,12 +233,12 @@ def refine_planes(
 def plane_deviations(
     reference, sources, infinities, baselines, planes, reach, tone, calibration, out
 ):
-    """Estimate the standard deviation of each pixel's inverse depth, 0 if invisible.
+    """Write the standard deviation of each pixel's inverse depth to ``out`` (H, W), 0 if unknown.
 
-    The least-squares bound for a window of N pixels with correlation rho, gradient g and motion m
-    per inverse depth along the epipolar line is ``(1 - rho^2) Var / (N mean((g m)^2))``, averaged
-    over the sources. Its root is multiplied by ``calibration[1]``, and a matching error of
-    ``calibration[0]`` pixels is added in quadrature.
+    A window of N pixels has correlation rho with a source, gradient g, and moves by m per unit of
+    inverse depth along the epipolar line. The least-squares bound of the variance is
+    ``(1 - rho^2) Var / (N mean((g m)^2))``; it is averaged over the sources. Its root is multiplied
+    by ``calibration[1]``, and a matching error of ``calibration[0]`` pixels is added in quadrature.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2

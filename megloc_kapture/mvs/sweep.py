@@ -2,9 +2,9 @@
 
 Planes parallel to the reference (Collins, CVPR 1996; Gallup et al., CVPR 2007) are scored by the
 two best normalised cross-correlations, regularised by semi-global matching (Hirschmueller, PAMI
-2008) at half size, and refined by PatchMatch (Bleyer et al., BMVC 2011) at full size. A pixel ``p``
-(homogeneous) of inverse depth ``w`` is in a source at ``infinity p + w baseline``, with ``infinity
-= K_s R K^-1`` and ``baseline = K_s t``.
+2008) at half size, and refined by PatchMatch (Bleyer et al., BMVC 2011) at full size. A homogeneous
+pixel ``p`` of inverse depth ``w`` projects to ``infinity p + w baseline`` in a source, with
+``infinity = K_s R K^-1`` and ``baseline = K_s t``.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ Image = NDArray[np.float32]
 _BLOCK = 16
 _MIN_PLANES = 16
 _REACH = 3  # half the side of a window
-_TONE = 20.0  # of 255, with pixel weight 1/e
-# semi-global penalties for one label and for more, and the contrast that halves the latter
+_TONE = 20.0  # difference from the centre's brightness (0 to 255) that has the weight 1/e
+# penalties for a step of one label and of more labels, and the contrast that halves the latter
 _P1, _P2, _EDGE = 8.0, 40.0, 20.0
 _DIRECTIONS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
-# matching error in pixels, and multiple of the least-squares bound: docs/experiments/mvs.md
+# matching error in pixels, and factor on the least-squares bound (docs/experiments/mvs.md)
 CALIBRATION = np.array([0.15, 2.0])
-_MAX_COST = 0.7  # 1 - ZNCC
+_MAX_COST = 0.7  # largest accepted 1 - ZNCC
 
 
 class SweepOptions(Options):
-    """Options of the plane sweep; defaults: docs/experiments/mvs.md."""
+    """Options of the plane sweep; docs/experiments/mvs.md has the reasons for the defaults."""
 
     max_planes: int = Field(
-        default=128, ge=_MIN_PLANES, le=512, description="number of depths tried, at half the size"
+        default=128, ge=_MIN_PLANES, le=512, description="largest number of planes, at half size"
     )
     passes: int = Field(
         default=2,
@@ -55,7 +55,7 @@ class SweepOptions(Options):
 
 
 class Sweep:
-    """Plane sweep at half size, semi-global matching, slanted planes at full size."""
+    """Plugin ``sweep``: plane sweep at half size, then slanted planes at full size."""
 
     name = "sweep"
     Options = SweepOptions
@@ -76,13 +76,13 @@ class Sweep:
         size = reference.camera.width, reference.camera.height
         planes = tangent_planes(cv2.resize(inverse, size, interpolation=cv2.INTER_LINEAR))
         deviations = refine(reference, sources, planes, limits, 0.5 * step, self.options.passes)
-        # depth at the far limit may be beyond it, as the sky
+        # the true depth at the far limit may be larger, as that of the sky
         deviations[planes[..., 0] <= limits[0] + 0.5 * step] = 0.0
         return as_estimate(reference.camera, planes, deviations)
 
 
 class ColmapStereo:
-    """COLMAP's PatchMatch (Schoenberger et al., ECCV 2016), for pycolmap with CUDA."""
+    """Plugin ``colmap``: COLMAP's PatchMatch (Schoenberger et al., ECCV 2016), needs CUDA."""
 
     name = "colmap"
 
@@ -92,7 +92,7 @@ class ColmapStereo:
         if not has_cuda():
             raise PluginError(
                 "the installed pycolmap has no CUDA, which COLMAP's stereo needs: install "
-                "pycolmap-cuda12 in its place, or take the estimator sweep"
+                "pycolmap-cuda12 in its place, or use the estimator sweep"
             )
 
     def estimate(
@@ -159,7 +159,7 @@ def planes_of(camera: Camera, depth_m: NDArray[Any], normals: NDArray[Any]) -> F
 
 
 def stereo_image(view: StereoView) -> Image:
-    """Return grey float32 (H, W) around 0; NaN where masked."""
+    """Return brightness float32 (H, W) with mean 0; NaN where masked."""
     grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     grey -= np.float32(grey.mean(dtype=np.float64))
     if view.mask is not None:
@@ -179,7 +179,7 @@ def _halved(view: StereoView) -> StereoView:
 def sweep(
     reference: StereoView, sources: Sequence[StereoView], limits: Floats, max_planes: int
 ) -> tuple[Image, float]:
-    """Return inverse depth float32 (H, W) between limits (far, near), and the plane step."""
+    """Return inverse depth float32 (H, W) and the step between planes; limits are (far, near)."""
     projections = [relative_projection(reference, source) for source in sources]
     step = pixel_step(projections, reference.camera, limits)
     wanted = int(np.ceil((limits[1] - limits[0]) / step)) + 1
@@ -218,7 +218,7 @@ def cost_volume(
 
 
 def semi_global(volume: NDArray[np.uint8], grey: Image) -> Floats:
-    """Find fractional labels float64 (H, W) of the least path costs in eight directions."""
+    """Find the fractional labels float64 (H, W) with the smallest path costs in 8 directions."""
     from megloc_kapture.mvs.kernels import add_path, best_labels
 
     total = np.zeros(volume.shape, np.uint16)
@@ -231,7 +231,7 @@ def semi_global(volume: NDArray[np.uint8], grey: Image) -> Floats:
 
 
 def tangent_planes(inverse: NDArray[Any]) -> Floats:
-    """Return planes float64 (H, W, 3) of inverse depth (H, W), with smoothed slopes."""
+    """Return tangent planes float64 (H, W, 3) of inverse depth (H, W), with smoothed slopes."""
     smooth = cv2.GaussianBlur(cv2.medianBlur(inverse, 5), (0, 0), 2)
     slopes = [cv2.Scharr(smooth, cv2.CV_32F, *axis) / 32 for axis in ((1, 0), (0, 1))]
     return np.stack([inverse, *slopes], axis=-1).astype(np.float64)
@@ -251,8 +251,8 @@ def refine(
     grey = stereo_image(reference)
     views = _compared(reference, sources)
     costs = np.full(grey.shape, 2.0, np.float32)
-    for turn in range(passes):
-        refine_planes(grey, *views, planes, costs, _REACH, _TONE, turn, step, limits)
+    for number in range(passes):
+        refine_planes(grey, *views, planes, costs, _REACH, _TONE, number, step, limits)
     deviations = matching_deviations(reference, sources, planes, CALIBRATION)
     deviations[costs > _MAX_COST] = 0.0
     return deviations
@@ -261,7 +261,7 @@ def refine(
 def matching_deviations(
     reference: StereoView, sources: Sequence[StereoView], planes: Floats, calibration: Floats
 ) -> Image:
-    """Return deviations (H, W) of the planes' inverse depth by matching; 0 without a match."""
+    """Estimate deviations (H, W) of the planes' inverse depth from matching; 0 without a match."""
     from megloc_kapture.mvs.plane_kernels import plane_deviations
 
     grey = stereo_image(reference)

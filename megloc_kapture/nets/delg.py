@@ -1,4 +1,4 @@
-"""DELG's global branch (Cao et al., ECCV 2020): a ResNet, generalized-mean pooling and a layer.
+"""DELG's global branch (Cao et al., ECCV 2020): a ResNet, GeM pooling and a linear layer.
 
 Its ResNet has two forms in TensorFlow; convolutions with bias identify the first::
 
@@ -62,7 +62,7 @@ class DelgNet(nn.Module):
         self.embedding = nn.Linear(channels, DESCRIPTOR_SIZE)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Compute vectors (B, 2048), not normalised, of RGB images (B, 3, H, W) in [-1, 1]."""
+        """Compute unnormalised vectors (B, 2048) of RGB images (B, 3, H, W) in [-1, 1]."""
         for number in range(1, 5):
             layer = self.get_submodule(f"layer{number}")
             image = layer(self._stem(image) if number == 1 else image)
@@ -84,15 +84,15 @@ class DelgNet(nn.Module):
 
 
 def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torch.Tensor:
-    """Sum the vectors of several scales (section 4.1) to unit vectors, float32 (B, 2048).
+    """Return the normalised sum of the vectors of several scales (section 4.1): float32 (B, 2048).
 
-    ``image`` is RGB (B, 3, H, W) in 0 to 255, resized bilinearly without smoothing; sides are
+    ``image`` is RGB (B, 3, H, W) in [0, 255], resized bilinearly without antialiasing; sides are
     rounded half to even.
     """
     normalised = (image - 128.0) / 128.0
     total = image.new_zeros(len(image), DESCRIPTOR_SIZE)
     for scale in scales:
-        # in TensorFlow's precision, which can decide the rounding of a half
+        # compute in float32 as TensorFlow does: the precision can decide the rounding of a half
         sides = [round(float(np.float32(n) * np.float32(scale))) for n in image.shape[-2:]]
         if min(sides) < _LEAST_PX:
             raise DataError(
@@ -110,7 +110,7 @@ def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
     blocks = {key.split(".")[1] for key in tensors if key.startswith("layer3.")}
     if len(blocks) not in RESNET_DEPTHS:
         raise DataError(
-            f"no DELG: {len(blocks)} blocks in the third stage, not 6 (ResNet-50) or 23 "
+            f"not DELG: {len(blocks)} blocks in the third stage, not 6 (ResNet-50) or 23 "
             f"(ResNet-101); found: {first_few(sorted(tensors), 8)}",
             path=where,
         )

@@ -1,9 +1,9 @@
-"""Global descriptors of convolutional trunks: NetVLAD, OpenIBL and AP-GeM.
+"""Global descriptors with convolutional backbones: NetVLAD, OpenIBL and AP-GeM.
 
 NetVLAD (Arandjelovic et al., CVPR 2016) and OpenIBL (Ge et al., ECCV 2020) share a network on
-VGG-16 with whitening; the order of its inputs and the mean colour differ. AP-GeM (Revaud et al.,
-ICCV 2019) is a ResNet with generalized-mean pooling and a linear layer. Keys are those of the
-authors' checkpoints, with additions by ``scripts/convert_weights.py``.
+VGG-16 with whitening; the order of the whitening's inputs and the mean colour differ. AP-GeM
+(Revaud et al., ICCV 2019) is a ResNet with generalized-mean pooling and a linear layer. Parameters
+have the names of the authors' checkpoints, with additions by ``scripts/convert_weights.py``.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from megloc_kapture.nets.trunks import (
 
 Order = Literal["dk", "kd"]
 
-STRIDE_PX = 16  # of the trunk, and the least image side
+STRIDE_PX = 16  # stride of the backbone, which is also the smallest image side
 _CONV5_3 = 28  # the last layer, without its ReLU: features have either sign
 _CHANNELS = 512
 _NUM_CLUSTERS, _OUTPUT_SIZE = 64, 4096
-# only in converted files of NetVLAD's authors
+# only the converted files of NetVLAD's authors have this key
 _AVERAGE_IMAGE = "average_image"
-# 255 times OpenIBL's mean for colours in [0, 1]
+# OpenIBL's mean for colours in [0, 1], times 255
 _OPENIBL_MEAN_RGB = (123.68, 116.779, 103.939)
 DESCRIPTOR_SIZE = 2048
 # optional whitening in a checkpoint, under scikit-learn's names
@@ -43,15 +43,15 @@ PCA_PARTS = ("mean", "components", "explained_variance", "whiten")
 
 
 class NetVladLayer(nn.Module):
-    """NetVLAD's layer: residuals to centres, summed by soft assignment.
+    """NetVLAD's layer: residuals to cluster centres, summed by soft assignment.
 
-    With unit features x_i, assignment weights w_k and centres c_k (equations 3 and 4 without
+    With unit-norm features x_i, assignment weights w_k and centres c_k (equations 3 and 4 without
     bias)::
 
         V(d, k) = sum_i a_k(x_i) (x_i(d) - c_k(d)),   a_k(x) = exp(w_k . x) / sum_k' exp(w_k' . x)
 
-    Each cluster is normalised, then the whole vector. ``order`` "dk": clusters run fastest, as in
-    MATLAB's code; "kd": features, as in OpenIBL's.
+    Each cluster is normalised, then the whole vector. In ``order`` "dk" the cluster index runs
+    fastest, as in the authors' MATLAB code; in "kd" the channel index, as in OpenIBL.
     """
 
     def __init__(self, num_clusters: int, size: int, *, order: Order) -> None:
@@ -61,7 +61,7 @@ class NetVladLayer(nn.Module):
         self.centroids = nn.Parameter(torch.rand(num_clusters, size))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Aggregate non-zero features (B, D, h, w) to unit vectors (B, K D)."""
+        """Aggregate non-zero features (B, D, h, w) to unit-norm vectors (B, K D)."""
         unit = functional.normalize(features, dim=1)
         weights = self.conv(unit).flatten(2).softmax(dim=1)
         # avoids the (B, K, D, h w) array of residuals
@@ -74,7 +74,7 @@ class NetVladLayer(nn.Module):
 
 
 class VggNetVlad(nn.Module):
-    """VGG-16 to conv5_3, NetVLAD's layer (``order``) and whitening, with OpenIBL's keys."""
+    """VGG-16 up to conv5_3, NetVLAD's layer (``order``) and whitening, with OpenIBL's keys."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class VggNetVlad(nn.Module):
         self.pca_layer = nn.Conv2d(num_clusters * _CHANNELS, output_size, 1)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Return unit vectors (B, output size) of RGB images (B, 3, H, W) in [0, 1]."""
+        """Return unit-norm vectors (B, output size) of RGB images (B, 3, H, W) in [0, 1]."""
         return self.vectors(self.features(image))
 
     def features(self, image: torch.Tensor) -> torch.Tensor:
@@ -111,7 +111,7 @@ class VggNetVlad(nn.Module):
 def netvlad(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
     if _AVERAGE_IMAGE not in tensors:
         raise DataError(
-            f"no weights of NetVLAD's authors: no {_AVERAGE_IMAGE} in it (OpenIBL's are for "
+            f"not the weights of NetVLAD's authors: it lacks {_AVERAGE_IMAGE} (OpenIBL's are for "
             "the plugin openibl)",
             path=where,
         )
@@ -164,10 +164,10 @@ class GeneralizedMean(nn.Module):
 
 
 class ApGemNet(ResNet):
-    """Network from image to unit vector, AP-GeM.
+    """AP-GeM's network from image to unit-norm vector.
 
-    ``mean`` and ``deviation``: of the training images, RGB in [0, 1]; ``normalised_features``:
-    normalise pooled features before the last layer.
+    ``mean`` and ``deviation`` are those of the training images, RGB in [0, 1].
+    ``normalised_features`` normalises pooled features before the last layer.
     """
 
     mean: torch.Tensor
@@ -189,7 +189,7 @@ class ApGemNet(ResNet):
             self.register_buffer(name, torch.tensor(list(values)).view(3, 1, 1), persistent=False)
 
     def describe(self, image: torch.Tensor) -> torch.Tensor:
-        """Return unit vectors, float32 (B, 2048), of RGB images (B, 3, H, W) in [0, 1]."""
+        """Return unit-norm vectors float32 (B, 2048) of RGB images (B, 3, H, W) in [0, 1]."""
         features = self((image - self.mean) / self.deviation)[-1]
         with torch.autocast(image.device.type, enabled=False):
             pooled = self.adpool(features)
@@ -199,10 +199,10 @@ class ApGemNet(ResNet):
 
 
 class Whitening(nn.Module):
-    """PCA whitening by a power of the variance, then unit length.
+    """PCA whitening by a power of the variance, then normalisation.
 
-    ``power`` 0.5 is scikit-learn's whitening, 0.25 the authors', 0 none. ``mean`` (D,),
-    ``components`` (K, D) and ``variance`` (K,) are of the PCA.
+    ``power`` is 0.5 in scikit-learn, 0.25 in the authors' evaluation; 0 does not whiten. The PCA
+    has ``mean`` (D,), ``components`` (K, D) and ``variance`` (K,).
     """
 
     mean: torch.Tensor
@@ -217,7 +217,7 @@ class Whitening(nn.Module):
         self.register_buffer("weight", (scale[:, None] * components.double()).float())
 
     def forward(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Whiten vectors (B, D): unit length, float32 (B, K)."""
+        """Whiten vectors (B, D) to unit-norm float32 (B, K)."""
         return functional.normalize(functional.linear(vectors.float() - self.mean, self.weight))
 
 
@@ -229,7 +229,7 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
     depth = RESNET_DEPTHS.get(len(blocks))
     if depth is None or "adpool.p" not in state:
         raise DataError(
-            "no AP-GeM: keys layer3.* of ResNet-50 or ResNet-101 and adpool.p expected", path=where
+            "not AP-GeM: it needs adpool.p and layer3.* of ResNet-50 or ResNet-101", path=where
         )
     net = ApGemNet(
         depth,
@@ -246,8 +246,8 @@ def whitening_from(
     known = sorted({key.split(".")[1] for key in tensors if key.startswith("pca.")})
     if name not in known:
         raise OptionError(
-            f"{where}: no whitening {name!r} in it; there is {', '.join(known) or 'none'} "
-            "(an empty name takes the vectors as they are)"
+            f"{where} has no whitening {name!r}; it has {', '.join(known) or 'none'} "
+            "(an empty name means no whitening)"
         )
     parts = {part: tensors.get(f"pca.{name}.{part}") for part in PCA_PARTS}
     mean, components, variance, whiten = parts.values()
@@ -261,7 +261,7 @@ def whitening_from(
             f"the whitening {name} has mean, components and variances of shapes {sizes}", path=where
         )
     if whiten and not bool((variance > 0).all()):
-        raise DataError(f"the whitening {name} has variances that are not positive", path=where)
+        raise DataError(f"some variances of the whitening {name} are not positive", path=where)
     return Whitening(mean, components, variance, power=power if whiten else 0.0)
 
 
@@ -270,5 +270,5 @@ def _three(
 ) -> list[float]:
     values = tensors[key].double().flatten().tolist() if key in tensors else list(default)
     if len(values) != 3:
-        raise DataError(f"{key} has {len(values)} values, not one for each of R, G, B", path=where)
+        raise DataError(f"{key} has {len(values)} values, not three for R, G and B", path=where)
     return values

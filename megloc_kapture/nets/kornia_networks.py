@@ -22,7 +22,7 @@ from megloc_kapture.nets.runtime import batch_counters, load_strictly
 
 Tensors = Mapping[str, torch.Tensor]
 _BLOCK = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")
-# of DISK's LightGlue; the published code does not read it
+# keys of DISK's LightGlue that the published code does not read
 _UNUSED = re.compile(r"^log_assignment\.\d+\.r$")
 # the authors' file of LighterGlue also contains its XFeat
 _MATCHER, _EXTRACTOR = "matcher.", "extractor.model.net."
@@ -44,7 +44,7 @@ def load_xfeat(tensors: Tensors, where: str) -> nn.Module:
 
 
 def xfeat_descriptors(network: Any, images: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
-    """Describe kornia's keypoints (N, 2) of an image (1, 3, H, W): unit vectors (N, 64)."""
+    """Return unit-norm descriptors (N, 64) at kornia's keypoints (N, 2) in image (1, 3, H, W)."""
     resized, *ratio_yx = network._preprocess_tensor(images)
     dense = functional.normalize(network.net(resized)[0], dim=1)
     places = xy / xy.new_tensor(ratio_yx[::-1])
@@ -81,9 +81,9 @@ def load_lightglue(
 ) -> nn.Module:
     """Build LightGlue (Lindenberger et al., ICCV 2023) from one of the authors' files.
 
-    The defaults are the authors': stop early (``depth_confidence``) and drop keypoints
-    (``width_confidence``). Tensors for these may be missing if they are off (-1). Half precision
-    excludes positions and assignment.
+    By default it stops early (``depth_confidence``) and drops keypoints (``width_confidence``), as
+    the authors do. Tensors for these may be missing if they are off (-1). Positions and assignment
+    are never in half precision.
     """
     tensors = {
         _BLOCK.sub(r"transformers.\2.\1.", key): value
@@ -95,7 +95,7 @@ def load_lightglue(
         raise DataError("this file does not fit LightGlue: it has no layers", path=where)
     projection = tensors.get("input_proj.weight")
     with _building:
-        # kornia's attention changes it for the whole process
+        # kornia's attention changes this setting for the whole process
         flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]
         try:
             network = _features().LightGlue(
@@ -128,7 +128,7 @@ def load_lightglue(
 def _cross_attention(
     block: Any, x0: torch.Tensor, x1: torch.Tensor, mask: None = None
 ) -> tuple[torch.Tensor, ...]:
-    """Compute kornia's cross-attention without its (heads, N, M) matrices: a fifth less time."""
+    """Compute kornia's cross-attention without (heads, N, M) matrices, in a fifth less time."""
     (query0, value0), (query1, value1) = (
         [
             project(x).unflatten(-1, (block.heads, -1)).transpose(1, 2)

@@ -1,4 +1,4 @@
-"""LPIPS 0.1 (Zhang et al., CVPR 2018, eq. 1): a learned image distance, over valid pixels."""
+"""LPIPS 0.1, a learned perceptual image distance over valid pixels (Zhang et al., CVPR 2018)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class AlexNetFeatures(nn.Sequential):
 
 
 class Fire(nn.Module):
-    """A fire module: 1x1 convolutions to few channels, then parallel 1x1 and 3x3 ones."""
+    """Fire module: a 1x1 convolution to few channels, then parallel 1x1 and 3x3 convolutions."""
 
     def __init__(self, channels: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -64,16 +64,16 @@ _TRUNKS: dict[Trunk, Callable[[], nn.Sequential]] = {
     "vgg": lambda: Vgg16Features(last=29),
     "squeeze": SqueezeNetFeatures,
 }
-# of the published module, for RGB in [-1, 1]
+# input normalisation of the published module, for RGB in [-1, 1]
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _MIN_LENGTH = 1e-10
-SMALLEST_PX = 64  # of the shorter side, for AlexNet's poolings
+SMALLEST_PX = 64  # smallest side that leaves enough cells after AlexNet's pooling
 
 
 class _Head(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
-        # follows a dropout in the published heads
+        # in the published heads, number 0 is a dropout
         self.model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -83,8 +83,8 @@ class _Head(nn.Module):
 class Lpips(nn.Module):
     """LPIPS with one of the three published trunks.
 
-    Keys are torchvision's ``features.*`` and the published ``lin{k}.model.1.weight``, which are
-    squares of the paper's weights.
+    Parameters have torchvision's names ``features.*`` and the published ``lin{k}.model.1.weight``;
+    the latter are the squares of the weights in equation 1 of the paper.
     """
 
     def __init__(self, trunk: Trunk) -> None:
@@ -95,17 +95,17 @@ class Lpips(nn.Module):
             self.add_module(f"lin{number}", _Head(channels))
 
     def forward(self, a: torch.Tensor, b: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-        """Return distances (B,) of pairs of images; NaN without valid pixels.
+        """Return the distances (B,) of image pairs; NaN for pairs without valid pixels.
 
-        Each feature is weighted by its cell's share of valid pixels. ``a`` and ``b``: (B, 3, H, W),
-        RGB in [0, 1], at least 64 pixels on either side; ``valid``: (B, 1, H, W), 1 where both
-        images are valid, else 0.
+        ``a`` and ``b`` (B, 3, H, W) are RGB in [0, 1], with sides of at least 64 pixels; ``valid``
+        (B, 1, H, W) is 1 where both images are valid, else 0. Each feature is weighted by the share
+        of valid pixels in its cell.
         """
         return self.between(self.described(a, valid), self.described(b, valid), valid)
 
     def described(self, image: torch.Tensor, valid: torch.Tensor) -> list[torch.Tensor]:
-        """Return unit features of the valid pixels, per layer (B, C, h, w); see :meth:`forward`."""
-        # channels last: the same convolutions and lengths, faster on a CPU
+        """Return each layer's unit-norm features (B, C, h, w); see :meth:`forward`."""
+        # channels last gives the same features, faster on a CPU
         x = in_fast_layout(self._normalised(image) * valid)
         normalised = []
         for number, layer in enumerate(self.features):

@@ -1,8 +1,9 @@
 """MegaLoc (Berton and Masone, CVPR Workshops 2025): DINOv2 ViT-B/14, SALAD, a linear layer.
 
-Keys are those of ``model.safetensors``; the older ``megaloc.torch``, with ``backbone.model`` and
-``mask_token``, is accepted too. DINOv2 (Oquab et al., TMLR 2024) is without registers. SALAD
-(Izquierdo and Civera, CVPR 2024) assigns patches to clusters and a dustbin by optimal transport.
+Parameters are named as in ``model.safetensors``; the older ``megaloc.torch``, with
+``backbone.model`` and ``mask_token``, is accepted too. DINOv2 (Oquab et al., TMLR 2024) has no
+registers. SALAD (Izquierdo and Civera, CVPR 2024) assigns patches to clusters and a dustbin by
+optimal transport.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ PATCH_PX = 14
 
 _EPSILON = 1e-6
 _MLP_RATIO = 4
-# in patches; prevents rounding a size down, and shifts all sampled positions
+# added to the number of patches so that sizes are not rounded down; shifts all sampled positions
 _OFFSET = 0.1
 
 
 class MegaLocNet(nn.Module):
-    """Network from image to unit vector of ``descriptor_size`` components; ViT-B/14 by default."""
+    """Network from image to unit-norm vector (``descriptor_size``,); ViT-B/14 by default."""
 
     def __init__(
         self,
@@ -49,7 +50,7 @@ class MegaLocNet(nn.Module):
         self.aggregator = nn.ModuleDict({"agg": salad, "linear": linear})
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Return vectors, float32 (B, 8448), of RGB images (B, 3, H, W) in [0, 1].
+        """Return unit-norm vectors float32 (B, 8448) of RGB images (B, 3, H, W) in [0, 1].
 
         Both sides are multiples of 14, with more patches than clusters.
         """
@@ -77,10 +78,10 @@ def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
 
 
 class Salad(nn.Module):
-    """SALAD: features of patches and of the image to one unit vector.
+    """SALAD: aggregates features of patches and of the image to one unit-norm vector.
 
-    ``channels`` in, ``hidden`` channels in the projections, and ``token_size + cluster_size *
-    clusters`` components out.
+    The input has ``channels``, the projections have ``hidden`` channels, and the output has
+    ``token_size + cluster_size * clusters`` components.
     """
 
     def __init__(
@@ -101,9 +102,9 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.tensor(1.0))
 
     def forward(self, patches: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
-        """Aggregate patches (B, C, h, w) and the whole (B, C) to float32 (B, D): section 3.3."""
+        """Aggregate features of patches (B, C, h, w) and image (B, C) to float32 (B, D)."""
         features = self.cluster_features(patches).flatten(2)
-        # half precision would leave two digits after the exponentials
+        # half precision would leave two digits after the exponential
         shares = assignment(self.score(patches).flatten(2).float(), self.dust_bin)
         summed = torch.matmul(features, shares.to(features).mT).float()
         summed = functional.normalize(summed, dim=1)
@@ -114,13 +115,13 @@ class Salad(nn.Module):
 def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
     """Assign N patches to K clusters by scores (B, K, N); return the shares (B, K, N).
 
-    Three Sinkhorn iterations in the log domain. Patches and clusters have mass 1; the dustbin, with
-    score ``dust_bin`` (), takes the rest.
+    It runs three Sinkhorn iterations in the log domain. Patches and clusters have mass 1; the
+    dustbin, with score ``dust_bin`` (), takes the rest.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:
         raise OptionError(
-            f"an image of {patches} patches is too small for {clusters} clusters; make it larger"
+            f"an image of {patches} patches is too small for {clusters} clusters; enlarge it"
         )
     scores = torch.cat([scores, dust_bin.to(scores).expand(batch, 1, patches)], dim=1)
     log_taken = scores.new_zeros(clusters + 1)
@@ -135,14 +136,14 @@ def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
 def _per_patch(channels: int, hidden: int, out: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(channels, hidden, 1),
-        nn.Identity(),  # placeholder of a dropout, for the keys
+        nn.Identity(),  # takes the place of a dropout, so that the keys fit
         nn.ReLU(),
         nn.Conv2d(hidden, out, 1),
     )
 
 
 class DinoV2(nn.Module):
-    """DINOv2: an image to one feature per patch and one for the whole; ViT-B by default."""
+    """DINOv2: features of an image's patches and of the whole image; ViT-B by default."""
 
     def __init__(
         self, *, channels: int = 768, depth: int = 12, heads: int = 12, grid: int = 37
@@ -159,7 +160,7 @@ class DinoV2(nn.Module):
         self.norm = nn.LayerNorm(channels, eps=_EPSILON)
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return features of patches (B, C, H // 14, W // 14) and of the whole (B, C).
+        """Return features of patches (B, C, H // 14, W // 14) and of the whole image (B, C).
 
         ``image`` is (B, 3, H, W), see :func:`megloc_kapture.nets.trunks.imagenet_normalised`;
         incomplete patches are cropped.
@@ -177,8 +178,9 @@ class DinoV2(nn.Module):
     def positions(self, rows: int, columns: int) -> torch.Tensor:
         """Return position embeddings, (1, 1 + rows * columns, C).
 
-        Bicubic without antialiasing by ``(rows + 0.1) / grid``, as in DINOv2, not ``rows / grid``,
-        as in transformers; they differ by up to 0.16 learnt positions at 23 patches of 37.
+        They are interpolated bicubically without antialiasing. The scale is ``(rows + 0.1) / grid``
+        as in DINOv2, not ``rows / grid`` as in transformers; for 23 patches and a grid of 37, these
+        differ by up to 0.16 grid positions.
         """
         if rows == columns == self.grid:
             return self.pos_embed

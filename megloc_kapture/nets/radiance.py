@@ -1,9 +1,9 @@
 """Radiance fields: rays to colour, depth, opacity and uncertainty.
 
-Volume rendering as in NeRF (Mildenhall et al., ECCV 2020, eq. 3), with transient part and loss of
-NeRF-W (Martin-Brualla et al., CVPR 2021, eqs. 8 to 13). Rays are ``origin + t direction``; with z =
-1 in the camera, t is depth along the optical axis. :class:`NerfW` has the keys of kwea123/nerf_pl's
-branch ``nerfw``; :class:`TriPlane` is small enough to train on a CPU.
+Volume rendering follows NeRF (Mildenhall et al., ECCV 2020, eq. 3); the transient part and the loss
+follow NeRF-W (Martin-Brualla et al., CVPR 2021, eqs. 8 to 13). Rays are ``origin + t direction``;
+directions have z = 1 in the camera, so t is depth along the optical axis. :class:`NerfW` has the
+keys of kwea123/nerf_pl's branch ``nerfw``; :class:`TriPlane` is small enough to train on a CPU.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import nn
 
-_DEPTH_SPREAD = 0.03  # of samples around a known depth, relative
+_DEPTH_SPREAD = 0.03  # relative spread of the samples around a known depth
 _EPSILON = 1e-10
 _BETA_MIN = 0.03  # uncertainty of a ray without transient density
 # NeRF-W: layers, width, skip connection; frequencies of points and directions; embedding sizes;
@@ -27,10 +27,10 @@ _RESOLUTIONS, _CHANNELS = (64, 128, 256), 12
 _GEOMETRY, _HIDDEN = 15, 64
 _POINT_FREQUENCIES, _DIRECTION_FREQUENCIES = 3, 2
 _APPEARANCE, _TRANSIENT = 8, 16
-# samples per ray: search in training, and in rendering, where surfaces are thin; then even, then
-# importance samples
+# samples per ray: density search in training, and in rendering, where surfaces are thin; even
+# samples; importance samples
 _LOOKING, _CLOSELY, _SPREAD, _THERE = 32, 96, 8, 16
-_REACH = 1.25  # limit of contracted space, whose uncontracted part ends at 1
+_REACH = 1.25  # contracted coordinates end here; up to 1 they are not contracted
 _MAX_LOG_DENSITY = 12.0
 _AXES = ((0, 1), (0, 2), (1, 2))
 
@@ -43,11 +43,11 @@ class Rays:
     # near, far: t of a ray's ends
     near: float
     far: float
-    # appearance, transient: embeddings (N, A) and (N, T) per image; None: the mean appearance, and
+    # appearance, transient: image embeddings (N, A) and (N, T); None means the mean appearance, and
     # no transients
     appearance: torch.Tensor | None = None
     transient: torch.Tensor | None = None
-    # float32 (N,), t of the known surface, sampled around; 0 where unknown
+    # float32 (N,), t of the known surface, around which samples are drawn; 0 where unknown
     depth: torch.Tensor | None = None
 
     def points(self, t: torch.Tensor) -> torch.Tensor:
@@ -61,11 +61,11 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    # sigma, rgb: static density (N, S), and colour (N, S, 3) in 0 to 1
+    # sigma, rgb: static density (N, S), and colour (N, S, 3) in [0, 1]
     sigma: torch.Tensor
     rgb: torch.Tensor
-    # transient_sigma, transient_rgb, transient_beta: the same of the transient part, and its
-    # uncertainty (N, S), or None
+    # transient_sigma, transient_rgb, transient_beta: density, colour and uncertainty (N, S) of the
+    # transient part, or None
     transient_sigma: torch.Tensor | None = None
     transient_rgb: torch.Tensor | None = None
     transient_beta: torch.Tensor | None = None
@@ -73,9 +73,9 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    rgb: torch.Tensor  # (N, 3) in 0 to 1; black where empty
+    rgb: torch.Tensor  # (N, 3) in [0, 1]; black where empty
     depth: torch.Tensor  # (N,), mean t; 0 where empty
-    opacity: torch.Tensor  # (N,), absorbed share of the light
+    opacity: torch.Tensor  # (N,), share of the light that the ray's samples absorb
     # (N,), standard deviation of the colour by NeRF-W's transient part, or the minimum
     beta: torch.Tensor
     weights: torch.Tensor  # (N, S), share of each sample
@@ -118,7 +118,7 @@ def spacings(t: torch.Tensor, rays: Rays) -> torch.Tensor:
 
 
 def stratified(rays: Rays, count: int, generator: torch.Generator | None) -> torch.Tensor:
-    """Sample one t in each of ``count`` pieces of a ray, which grow with t: (N, count)."""
+    """Sample one t (N, count) in each of ``count`` intervals of a ray, which grow with t."""
     number = len(rays.origins)
     shares = torch.arange(count, device=rays.origins.device, dtype=rays.origins.dtype)
     within = _uniform((number, count), generator, rays.origins)
@@ -129,7 +129,7 @@ def stratified(rays: Rays, count: int, generator: torch.Generator | None) -> tor
 def importance(
     t: torch.Tensor, weights: torch.Tensor, count: int, generator: torch.Generator | None
 ) -> torch.Tensor:
-    """Sample (N, count) by the weights (N, S) at t (N, S): NeRF, section 5.2."""
+    """Draw importance samples (N, count) by the weights (N, S) at t (N, S): NeRF, section 5.2."""
     edges = 0.5 * (t[:, 1:] + t[:, :-1])
     inner = weights[:, 1:-1].detach() + 1e-5
     shares = torch.cumsum(inner / inner.sum(1, keepdim=True), dim=1)
@@ -145,7 +145,7 @@ def importance(
 def about_depth(
     depth: torch.Tensor, instead: torch.Tensor, generator: torch.Generator | None
 ) -> torch.Tensor:
-    """Sample (N, S) evenly around known depths (N,); elsewhere use ``instead`` (N, S)."""
+    """Return even samples (N, S) around known depths (N,); elsewhere return ``instead`` (N, S)."""
     count = instead.shape[1]
     drawn = torch.arange(count, device=depth.device, dtype=depth.dtype)
     drawn = (drawn + _uniform(tuple(instead.shape), generator, depth)) / count
@@ -258,7 +258,7 @@ class NerfW(nn.Module):
         return self.embedding_t
 
     def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """Render rays; the generator draws samples, else they are evenly spaced."""
+        """Render rays; samples are random with a generator, else evenly spaced."""
         unit = nn.functional.normalize(rays.directions, dim=1)
         t = stratified(rays, _COARSE, generator)
         coarse = composite(t, spacings(t, rays), self.nerf_coarse(rays.points(t), unit))
@@ -274,8 +274,8 @@ class TriPlane(nn.Module):
 
     A point's features are products of three planes (K-Planes, Fridovich-Keil et al., CVPR 2023, eq.
     1); small networks turn them into density, colour and transients. Samples lie around the known
-    depth, or are found by a density pass. Space beyond -1 to 1 is contracted. ``num_images`` and
-    ``num_lights``: see :class:`NerfW`; ``unconstrained``: with varying light and moving objects.
+    depth, or a density pass places them. Space beyond -1 to 1 is contracted. For ``num_images`` and
+    ``num_lights`` see :class:`NerfW`; ``unconstrained`` models varying light and moving objects.
     """
 
     def __init__(

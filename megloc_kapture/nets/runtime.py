@@ -1,4 +1,4 @@
-"""Runtime of networks: devices, precision, inputs, checkpoints, and plugins with a network."""
+"""Devices, precision, inputs and checkpoints of networks, and the base of network plugins."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ _loading_lock = Lock()
 class NetworkOptions(Options):
     device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
     half_precision: bool = Field(
-        default=False, description="float16 on a GPU, bfloat16 on a CPU; never for keypoints"
+        default=False,
+        description="compute in float16 on a GPU, bfloat16 on a CPU, except for keypoints",
     )
 
 
@@ -70,7 +71,7 @@ def _warn_of_slow_half() -> None:
 
 @contextmanager
 def without_tf32(device: torch.device) -> Iterator[None]:
-    """Compute products and convolutions of float32 in full precision, in all threads."""
+    """Compute float32 products and convolutions in full precision, in all threads."""
     if device.type == "cpu":
         yield
         return

@@ -1,14 +1,14 @@
 """Dense score maps: non-maximum suppression, interpolation, special convolutions.
 
 Non-maximum suppression is SuperPoint's as published by SuperGlue's authors: maxima suppress their
-neighbourhood, and maxima of the rest are added, twice. In deformable convolution (Dai et al., ICCV
-2017; with amplitudes: Zhu et al., CVPR 2019, eq. 1) every tap reads the input bilinearly, zero
-outside::
+neighbourhood; then, twice, maxima of the remaining pixels are added. In deformable convolution (Dai
+et al., ICCV 2017; with amplitudes: Zhu et al., CVPR 2019, eq. 1) every tap reads the input
+bilinearly, zero outside::
 
     y(p) = sum_k w_k m_k(p) x(p + p_k + offset_k(p))
 
-``embedding_bag`` reads the four rows of a pixel-by-channel table, then follows a matrix product; on
-a CPU this is several times faster than ``grid_sample``.
+``embedding_bag`` interpolates four rows of a pixel-by-channel table, and a matrix product applies
+the weights. On a CPU this is several times faster than ``grid_sample``.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from torch.nn import functional
 
 CELL_PX = 8
 _EDGE_STEP = 3  # pixels between the samples of the edge test's second differences
-# values gathered at once: cache size of a CPU, worthwhile launch on a GPU
+# number of values gathered at once: fits the cache of a CPU, and occupies a GPU
 _VALUES_AT_ONCE = {"cpu": 1 << 20, "cuda": 1 << 27}
 
 
 @dataclass(frozen=True, eq=False)
 class SelectedPixels:
-    """Pixels of one score map, best first; ties by y, then x."""
+    """Pixels of one score map, best first; ties are sorted by y, then x."""
 
-    # xy, scores: int64 (N, 2), columns and rows of the map, and (N,)
+    # xy: int64 (N, 2), columns and rows of the map; scores: (N,)
     xy: torch.Tensor
     scores: torch.Tensor
     num_masked: int
@@ -102,7 +102,7 @@ def select_pixels(
     """
     height, width = scores.shape
     inner = scores[border : max(height - border, border), border : max(width - border, border)]
-    yx = torch.nonzero(inner > threshold) + border  # in the order of y, then x
+    yx = torch.nonzero(inner > threshold) + border  # sorted by y, then x
     num_masked = 0
     if mask is not None:
         allowed = torch.from_numpy(np.ascontiguousarray(mask[:height, :width])).to(scores.device)
@@ -119,9 +119,9 @@ def soft_argmax(
 ) -> torch.Tensor:
     """Average positions around each pixel, weighted by exp(score / temperature).
 
-    ALIKED's differentiable keypoint detection (Zhao et al., TIM 2023). ``scores`` are (H, W);
-    ``xy`` int64 (N, 2), columns and rows, at least ``radius`` from the border. Returns (N, 2);
-    pixel centres are integers.
+    This is ALIKED's differentiable keypoint detection (Zhao et al., TIM 2023). ``scores`` are
+    (H, W); ``xy`` int64 (N, 2) are columns and rows, at least ``radius`` from the border. Returns
+    (N, 2); pixel centres are integers.
     """
     side = torch.arange(-radius, radius + 1, device=scores.device)
     steps = torch.cartesian_prod(side, side)
@@ -133,9 +133,9 @@ def soft_argmax(
 def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
     """Find the paraboloid's peak around each pixel, at most half a pixel away per axis.
 
-    One Newton step of the score map (H, W) with central differences (Lowe, IJCV 2004, section 4),
-    zero for a singular Hessian. ``xy`` is int64 (N, 2), columns and rows, off the border. Returns
-    (N, 2); pixel centres are integers.
+    It takes one Newton step on the score map (H, W) with central differences (Lowe, IJCV 2004,
+    section 4), or none if the Hessian is singular. ``xy`` int64 (N, 2) are columns and rows, not on
+    the border. Returns (N, 2); pixel centres are integers.
     """
     x, y = xy.unbind(1)
     gradient_x = (scores[y, x + 1] - scores[y, x - 1]) / 2
@@ -149,13 +149,13 @@ def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
 
 
 def on_no_edge(scores: torch.Tensor, xy: torch.Tensor, max_ratio: float) -> torch.Tensor:
-    """Return a mask (N,) of pixels off edges of the score map (Lowe, IJCV 2004, section 4.1).
+    """Return a mask (N,) of pixels not on edges of the score map (Lowe, IJCV 2004, section 4.1).
 
     Parameters
     ----------
     scores : (H, W).
     xy : int64 (N, 2), columns and rows, 3 pixels or more from the map's border.
-    max_ratio : of the larger principal curvature to the smaller.
+    max_ratio : largest ratio of the larger principal curvature to the smaller.
     """
     xx, yy, mixed = _second_differences(scores, xy, _EDGE_STEP)
     determinant = xx * yy - mixed * mixed
@@ -227,7 +227,7 @@ def read_bilinear(
 
 
 def pixel_table(values: torch.Tensor) -> torch.Tensor:
-    """Reshape (C, H, W) to (H W, C), at least float32; no copy if channels-last."""
+    """Reshape (C, H, W) to (H W, C), in float32 or float64; channels-last memory is not copied."""
     exact = values.to(torch.promote_types(values.dtype, torch.float32))
     return exact.permute(1, 2, 0).reshape(-1, len(values))
 
@@ -235,7 +235,7 @@ def pixel_table(values: torch.Tensor) -> torch.Tensor:
 def conv_same(
     x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, stride: int
 ) -> torch.Tensor:
-    """Convolve with TensorFlow's padding SAME: with stride 2, even sides only at their end."""
+    """Convolve with TensorFlow's SAME padding: at stride 2, even sides are padded at the end."""
     margins: list[int] = []
     for size, kernel in zip(x.shape[:1:-1], weight.shape[:1:-1], strict=True):
         total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
@@ -253,7 +253,7 @@ def deform_conv2d(
     bias: torch.Tensor | None = None,
     mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Apply a 3x3 deformable convolution, padded by one, as torchvision's; return (B, D, H, W).
+    """Apply a 3x3 deformable convolution with padding 1, like torchvision; return (B, D, H, W).
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""SuperGlue (Sarlin, DeTone, Malisiewicz and Rabinovich, CVPR 2020), with the official keys.
+"""SuperGlue (Sarlin, DeTone, Malisiewicz and Rabinovich, CVPR 2020), with official parameter names.
 
 All keypoints of a batch are in one tensor without padding; only attention and transport separate
 the images. Optimal transport (section 3.2) is Sinkhorn's algorithm with log potentials and
 matrix-vector products of exp(Z + u + v), whose scales are absorbed before they grow (Schmitzer,
-"Stabilized sparse scaling algorithms", SIAM J. Sci. Comput. 2019, section 3.1). After a first
-iteration in the log domain no product overflows, and omitted terms are less than 1e-7 of a sum.
+"Stabilized sparse scaling algorithms", SIAM J. Sci. Comput. 2019, section 3.1). The first iteration
+is in the log domain; after it no product overflows, and omitted terms are less than 1e-7 of a sum.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from torch.nn import functional
 from megloc_kapture.nets.runtime import load_strictly
 
 _HEADS = 4
-_LARGEST_SCALE = 2.0e4  # scales beyond it, or below its inverse, are absorbed into the potentials
-_SMALLEST_ENTRY = 1e-30  # of the kernel; avoids slow subnormal products
+_LARGEST_SCALE = 2.0e4  # larger scales, or those below its inverse, are absorbed into potentials
+_SMALLEST_ENTRY = 1e-30  # lower bound of the kernel's entries, which avoids slow subnormal products
 _PADDING = -1e30  # zero mass, but with a gradient
 
 
@@ -36,7 +36,7 @@ class ImageKeypoints:
 
 
 class SuperGlueNet(nn.Module):
-    """SuperGlue's network: keypoints of image pairs to log assignments.
+    """SuperGlue's network from keypoints of image pairs to log assignments.
 
     The last of ``encoder_sizes`` is the descriptor size D; ``num_layers`` alternate self and cross
     attention.
@@ -177,7 +177,7 @@ def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: 
 
 
 def normalise_keypoints(xy: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """Normalise pixels (N, 2), first centre (0, 0), by the image's centre and larger side."""
+    """Normalise pixels (N, 2) by the image's centre and larger side; the first centre is (0, 0)."""
     size = torch.tensor([width, height], dtype=xy.dtype, device=xy.device)
     return (xy - size / 2) / (0.7 * size.max())
 
@@ -185,7 +185,7 @@ def normalise_keypoints(xy: torch.Tensor, width: int, height: int) -> torch.Tens
 def mutual_matches(
     log_assignment: torch.Tensor, threshold: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return mutual best matches of (N + 1, M + 1): int64 (K, 2), by row, and scores (K,)."""
+    """Return mutual best matches int64 (K, 2), sorted by row, and scores (K,) of (N + 1, M + 1)."""
     inner = log_assignment[:-1, :-1]
     values, columns = inner.max(dim=1)
     rows = torch.arange(len(inner), device=inner.device)

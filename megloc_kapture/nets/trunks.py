@@ -1,7 +1,7 @@
-"""Trunks of published networks without classifiers, and generalized-mean pooling.
+"""Backbones of published networks, without classifiers, and generalized-mean (GeM) pooling.
 
-VGG-16 (Simonyan and Zisserman, ICLR 2015) and ResNet (He et al., CVPR 2016) with torchvision's
-keys; the ResNet has its stride on a bottleneck's 3x3 convolution.
+VGG-16 (Simonyan and Zisserman, ICLR 2015) and ResNet (He et al., CVPR 2016) have torchvision's
+parameter names.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-# channels of each stage's convolutions; each stage ends with a pooling
+# channels of each stage's convolutions; each stage ends with max pooling
 _VGG_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 Depth = Literal[50, 101]
 RESNET_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
@@ -20,15 +20,15 @@ RESNET_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}
 RESNET_WIDTHS, RESNET_EXPANSION = (64, 128, 256, 512), 4
 # ImageNet's statistics, RGB in [0, 1]
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# lower bound of activations: powers and gradients stay finite
+# activations are clamped to this so that powers and gradients stay finite
 _MINIMUM = 1e-6
 
 
 class Vgg16Features(nn.Sequential):
     """VGG-16 (configuration D) up to layer ``last``, numbered as torchvision's ``features``.
 
-    Layer 28 is conv5_3 without its ReLU (512 channels, 1/16 of the size), 29 its ReLU. Poolings
-    drop odd last rows and columns.
+    Layer 28 is conv5_3 without its ReLU (512 channels, 1/16 of the image size), layer 29 that ReLU.
+    Max pooling drops an odd last row or column.
     """
 
     def __init__(self, *, last: int) -> None:
@@ -50,7 +50,7 @@ class Vgg16Features(nn.Sequential):
 
 
 def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
-    """Normalise an RGB image (B, 3, H, W) in [0, 1] by ImageNet's mean and deviation."""
+    """Normalise RGB images (B, 3, H, W) in [0, 1] by ImageNet's mean and standard deviation."""
     mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
     return (image - mean) / image.new_tensor(IMAGENET_DEVIATION)[:, None, None]
 
@@ -58,8 +58,8 @@ def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
 class Bottleneck(nn.Module):
     """Bottleneck block of a ResNet, with the stride on the 3x3 convolution.
 
-    ``strided_first`` puts the stride on the first 1x1 convolution instead. ``bias`` is of the
-    convolutions, ``epsilon`` of the normalisations.
+    ``strided_first`` puts the stride on the first 1x1 convolution instead. ``bias`` adds biases to
+    the convolutions; ``epsilon`` is that of the batch normalisations.
     """
 
     def __init__(
@@ -111,11 +111,11 @@ class ResNet(nn.Module):
         channels = 64
         sizes = zip(RESNET_WIDTHS, RESNET_BLOCKS[depth], strict=True)
         for number, (width, blocks) in enumerate(sizes, start=1):
-            reach = 2 if dilated and number == 4 else 1
+            stage_dilation = 2 if dilated and number == 4 else 1
             stage = nn.Sequential()
             for block in range(blocks):
-                stride = 2 if number > 1 and block == 0 and reach == 1 else 1
-                dilation = reach if block else 1
+                stride = 2 if number > 1 and block == 0 and stage_dilation == 1 else 1
+                dilation = stage_dilation if block else 1
                 stage.append(Bottleneck(channels, width, stride=stride, dilation=dilation))
                 channels = width * RESNET_EXPANSION
             self.add_module(f"layer{number}", stage)
@@ -132,11 +132,10 @@ class ResNet(nn.Module):
 
 
 def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> torch.Tensor:
-    """Compute the power mean (B, C) of each channel: 1 is the mean, infinity the maximum.
+    """Compute the generalized mean (B, C) of features (B, C, H, W), clamped to at least 1e-6.
 
-    ``features`` (B, C, H, W) are clamped to 1e-6; the result is at least float32. ``power`` is not
-    0.
+    Power 1 is the mean, infinity the maximum; 0 is invalid. The result is float32 or float64.
     """
-    # the third power of 41 overflows half precision
+    # half precision overflows at 41 to the third power
     values = features if features.dtype == torch.float64 else features.float()
     return values.clamp(min=_MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)

@@ -1,7 +1,7 @@
 """DeepLabV3+ trained on Cityscapes as a segmenter of people and vehicles.
 
-Chen et al., ECCV 2018, output stride 16, with the keys of VainF's checkpoints: ResNet-101 or
-MobileNetV2 backbone, plain convolutions in the head as in all public checkpoints.
+The network (Chen et al., ECCV 2018) has output stride 16, a ResNet-101 or MobileNetV2 backbone and
+the keys of VainF's checkpoints. As in all public checkpoints, the head has plain convolutions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from megloc_kapture.nets.trunks import ResNet, imagenet_normalised
 
 Backbone = Literal["resnet101", "mobilenet"]
 
-# by train id of cityscapesScripts; the categories human and vehicle come last
+# in the order of cityscapesScripts' train ids; the categories human and vehicle come last
 CITYSCAPES_CLASSES = (
     *("road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign"),
     *("vegetation", "terrain", "sky"),
@@ -98,8 +98,8 @@ def backbone_of(keys: Collection[str], where: str) -> Backbone:
         if key.startswith("backbone.low_level_features."):
             return "mobilenet"
     raise DataError(
-        "no DeepLabV3+: keys backbone.layer1.* (ResNet-101) or backbone.low_level_features.* "
-        "(MobileNetV2) expected",
+        "not DeepLabV3+: it needs keys backbone.layer1.* (ResNet-101) or "
+        "backbone.low_level_features.* (MobileNetV2)",
         path=where,
     )
 
@@ -167,7 +167,7 @@ class Head(nn.Module):
 
 
 class InvertedResidual(nn.Module):
-    """Expansion by 1x1, depthwise 3x3, projection by 1x1 without activation."""
+    """1x1 expansion, 3x3 depthwise convolution, and 1x1 projection without activation."""
 
     def __init__(
         self, channels: int, out: int, *, expansion: int, stride: int, dilation: int
@@ -194,8 +194,8 @@ class InvertedResidual(nn.Module):
 class MobileNetV2(nn.Module):
     """MobileNetV2 (Sandler et al., CVPR 2018) without the classifier, at output stride 16.
 
-    As in training of the weights, the first convolution has no padding, and blocks pad their input
-    before the expansion: the expanded border is not zero.
+    As in the training of the weights, the first convolution has no padding, and blocks pad their
+    input before the expansion, so that the expanded border is not zero.
     """
 
     def __init__(self) -> None:
@@ -204,8 +204,8 @@ class MobileNetV2(nn.Module):
         layers: list[nn.Module] = [_activated(3, channels, 3, nn.ReLU6, stride=2)]
         for expansion, out, blocks, stride, first, others in _MOBILENET_STAGES:
             for block in range(blocks):
-                steps, reach = (1, others) if block else (stride, first)
-                sizes = {"expansion": expansion, "stride": steps, "dilation": reach}
+                step, dilation = (1, others) if block else (stride, first)
+                sizes = {"expansion": expansion, "stride": step, "dilation": dilation}
                 layers.append(InvertedResidual(channels, out, **sizes))
                 channels = out
         # slices of a Sequential keep the layer numbers, as in the checkpoint
@@ -214,13 +214,13 @@ class MobileNetV2(nn.Module):
         self.high_level_features = everything[_NUM_LOW_LEVEL:]
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return 24 and 320 channels of a normalised image (B, 3, H, W) at 1/4 and 1/16 size."""
+        """Return 24 channels at 1/4 size and 320 at 1/16 of normalised images (B, 3, H, W)."""
         low_level = self.low_level_features(image)
         return low_level, self.high_level_features(low_level)
 
 
 class DeepLabV3Plus(nn.Module):
-    """Logits per class at about 1/4 resolution."""
+    """DeepLabV3+, which computes logits per class at about 1/4 resolution."""
 
     def __init__(self, backbone: Backbone, *, num_classes: int) -> None:
         super().__init__()
@@ -233,7 +233,7 @@ class DeepLabV3Plus(nn.Module):
             self.classifier = Head(320, 24, num_classes)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Return logits (B, classes, h, w) of an RGB image (B, 3, H, W) in [0, 1]."""
+        """Return logits (B, classes, h, w) of RGB images (B, 3, H, W) in [0, 1]."""
         features = self.backbone(imagenet_normalised(image))
         return self.classifier(features[0], features[-1])
 

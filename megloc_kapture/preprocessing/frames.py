@@ -34,7 +34,7 @@ from megloc_kapture.geometry.cameras import (
 from megloc_kapture.io.colmap import undistorted_pinhole
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Options
 
-# coarse checks suffice: between two valid points all points are valid, as the models fold slowly
+# check every 16th pixel: points between two valid ones are valid, as distortion changes slowly
 _CHECKED_EVERY = 16
 # grid spacing of interpolated maps, in original pixels: errors are below 0.005 px, while OpenCV's
 # interpolation rounds to 1/32 px
@@ -44,7 +44,8 @@ _ROUNDING_PX = 1e-6
 # residual of COLMAP's iterative undistortion
 _SAME_PX = 1e-3
 Floats = NDArray[np.float64]
-# distortion is a polynomial of the tangent: zero coefficients mean none (not so for fisheye models)
+# in these models distortion is a polynomial of the tangent, so zero coefficients mean no distortion
+# (unlike in fisheye models)
 _POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
 Float32 = NDArray[np.float32]
 
@@ -143,18 +144,18 @@ def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
     return maps[0], maps[1]
 
 
-_SIDE_STEP_PX = 8  # of preprocessed images
+_SIDE_STEP_PX = 8  # sides of preprocessed images are multiples of this
 
 
 class FrameOptions(Options):
-    """Size and projection of the images; by default they stay as they are."""
+    """Options for size and projection of the images, which by default do not change."""
 
     max_size_px: int | None = Field(
         default=None,
         gt=0,
-        description="larger side that images are reduced to; unset: original size",
+        description="longer side of reduced images; unset: original size",
     )
-    upscale: bool = Field(default=False, description="also enlarge smaller images to that side")
+    upscale: bool = Field(default=False, description="also enlarge smaller images to this size")
     undistort: bool = Field(default=False, description="remove lens distortion")
 
 
@@ -213,7 +214,7 @@ def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
 
 
 def carry_points(source: Camera, target: Camera, points_px: NDArray[np.floating[Any]]) -> Floats:
-    """Carry points (N, 2) through their rays between cameras with the same centre and axes.
+    """Map points (N, 2) along their rays between cameras with the same centre and axes.
 
     Returns float64 (N, 2), NaN outside the target image.
     """

@@ -14,32 +14,32 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.values import Options
 
-# bounds the memory of a polygon test
+# polygons are tested in blocks of rows, to bound memory
 _ROWS_AT_ONCE = 256
-# fewer images agree by chance
+# edges of fewer images may agree by chance
 MIN_IMAGES = 10
 # more images add no information
 MAX_IMAGES = 60
 _WORKING_SIZE_PX = 256
-_NOISE_PER_PX = 3.0  # grey levels per working px; weaker edges count less
+_NOISE_PER_PX = 3.0  # grey levels per pixel of the reduced image; weaker edges count less
 # mean agreement of two images' edges, -1 to 1: static edges reach 0.5, moving edges at most 0.1
 _MIN_AGREEMENT = 0.3
 _WIDE_PX, _NARROW_PX = 9, 3  # averaging windows
-# a pixel changes if it has edges that disagree
+# a pixel is changing if its edges are strong, relative to the median, and disagree
 _CHANGING_AGREEMENT, _CHANGING_STRENGTH = 0.1, 0.5
-_MAX_CHANGING = 0.4  # share of a column below the frontier
-_MIN_RUN = 0.1  # of the width; bonnets are wider
-_MAX_GAP = 0.05  # of the width; smaller gaps are closed
-# varying light lowers the detected frontier by up to this
+_MAX_CHANGING = 0.4  # largest share of changing pixels in a column below the frontier
+_MIN_RUN = 0.1  # smallest width of a region, as a share of the image's; bonnets are wider
+_MAX_GAP = 0.05  # smaller gaps, as a share of the width, are closed
+# varying light lowers the detected frontier by up to this much
 _MARGIN_PX = 4
-_MAX_AREA = 0.6  # of the image; larger regions mean a static camera
+_MAX_AREA = 0.6  # a region with a larger share of the image means a static camera
 Float32 = NDArray[np.float32]
 
 
 class FixedMask(Options):
-    """Mask of every image of a camera: one of ``file``, ``polygon``, ``bottom_share``.
+    """Mask for all images of a camera, by one of ``file``, ``polygon`` and ``bottom_share``.
 
-    All of them refer to the original images, before they are undistorted and resized.
+    These refer to the original images, before undistortion and resizing.
     """
 
     camera: str = Field(
@@ -65,9 +65,9 @@ class FixedMask(Options):
     def _exactly_one(self) -> FixedMask:
         given = [self.file, self.polygon, self.bottom_share]
         if sum(value is not None for value in given) != 1:
-            raise ValueError("a fixed mask takes one of file, polygon and bottom_share")
+            raise ValueError("a fixed mask needs exactly one of file, polygon and bottom_share")
         if any(not 0 <= share <= 1 for corner in self.polygon or () for share in corner):
-            raise ValueError("a polygon's corners are shares between 0 and 1")
+            raise ValueError("coordinates of a polygon's corners must be between 0 and 1")
         return self
 
     def is_for(self, sensor_id: str, image: str) -> bool:
@@ -83,7 +83,10 @@ class FixedMask(Options):
 
 
 def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> NDArray[np.bool_]:
-    """Return the mask (H, W) outside a polygon (N, 2) in shares of the sides; even-odd rule."""
+    """Return a mask (H, W), True outside a polygon (N, 2) by the even-odd rule.
+
+    Corners are in shares of width and height.
+    """
     x0, y0 = (np.asarray(corners, np.float64) * [width, height]).T
     x1, y1 = np.roll(x0, -1), np.roll(y0, -1)
     x = np.arange(width) + 0.5
@@ -92,7 +95,8 @@ def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> N
         rows = outside[start : start + _ROWS_AT_ONCE]
         y = np.arange(start, start + len(rows)) + 0.5
         for ax, ay, bx, by in zip(x0, y0, x1, y1, strict=True):
-            # edges crossed by a ray to the left; half open, so that a corner counts once
+            # a pixel changes sides at each edge that a ray to the left crosses; edges are half open
+            # so that a corner counts once
             crossed = (ay <= y) != (by <= y)
             if crossed.any():
                 at = ax + (y[crossed] - ay) * ((bx - ax) / (by - ay))
@@ -101,7 +105,7 @@ def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> N
 
 
 def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
-    """Erode a mask bool (H, W), True = use, by a Euclidean margin, but not at the image border."""
+    """Erode a mask bool (H, W), True = use, by a Euclidean margin, except at the image border."""
     if margin_px <= 0 or mask.all():
         return mask
     import cv2  # takes 0.1 s, and most commands do not need it
@@ -114,10 +118,10 @@ def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class UnchangingRegion:
-    """Static region below a frontier across the image; falsy with a reason if empty.
+    """Static region below a frontier across the image; if empty, it is false and has a reason.
 
-    The frontier is in shares of the height from the top, for equally wide columns; 1 means no
-    region.
+    The frontier has a value per column, all of equal width: its distance from the top as a share of
+    the height, 1 in columns without a region.
     """
 
     frontier: tuple[float, ...]
@@ -136,7 +140,7 @@ class UnchangingRegion:
 
 
 def edge_directions(image: NDArray[np.uint8]) -> Float32:
-    """Return float32 (h, w, 2) edge directions, length 0 to 1, of a downscaled RGB image."""
+    """Return normalised gradients float32 (h, w, 2), length 0 to 1, of a downscaled RGB image."""
     import cv2
 
     height, width = image.shape[:2]
@@ -166,7 +170,7 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
         total, lengths, squares = total + directions, lengths + length, squares + length**2
         count += 1
     assert count >= MIN_IMAGES
-    # sums over all pairs of different images: dot products, and products of lengths
+    # over all pairs of different images, sum dot products and products of lengths
     agreeing = np.square(total).sum(axis=-1) - squares
     present = np.square(lengths) - squares
     wide, narrow = (
@@ -184,7 +188,7 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
         return UnchangingRegion(nothing, "its images have no static region at the bottom")
     if 1 - tops.mean() / height > _MAX_AREA:
         return UnchangingRegion(
-            nothing, "nearly its whole image is static: the camera hardly moves"
+            nothing, "nearly the whole image is static, so the camera hardly moves"
         )
     tops = np.where(tops < height, np.maximum(tops - _MARGIN_PX, 0), tops)
     return UnchangingRegion(tuple(float(top) for top in tops / height))

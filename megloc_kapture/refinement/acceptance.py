@@ -1,4 +1,4 @@
-"""Acceptance of a refined pose: fit, covariance and decision."""
+"""Acceptance test of a refined pose, with its fit to the references and its covariance."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ from megloc_kapture.refinement.photometric import (
 from megloc_kapture.refinement.pyramid import Appearance, ChosenPoints
 from megloc_kapture.values import Options, RigidTransform
 
-# chi-squared quantile (six degrees of freedom, p = 0.999) for a squared Mahalanobis distance
+# squared Mahalanobis distance of two poses above which they differ significantly: chi-squared
+# quantile, six degrees of freedom, p = 0.999
 CHI2_OF_CHANCE = 22.46
-# displacements below this are rounding, however small the covariance; pixels of the level
+# smaller displacements are rounding errors, however small the covariance; pixels of the level
 _LEAST_PX = 1e-3
 Float64 = NDArray[np.float64]
 _CHANGE = 0.5  # largest change of the residuals by a finite difference, in standard deviations
-# least share of the normal equations that the objective's curvature must have
+# the objective's curvature must be at least this share of the normal equations'
 _LEAST_SHARE = 0.02
 # displacement of points on either side of a finite difference, pixels of the level
 _CURVATURE_PX = 0.5
-# largest displacement of perturbed starts, pixels of the level
-_BESIDE = (-4.0, -2.0, 0.0, 2.0, 4.0)
-# least ratio of the smallest to the largest eigenvalue of a determined pose
+# perturbed starts along each direction, in steps of _CURVATURE_PX
+_START_STEPS = (-4.0, -2.0, 0.0, 2.0, 4.0)
+# the pose is undetermined if the eigenvalues of the normal equations have a smaller ratio
 _LEAST_CURVATURE = 1e-7
 
 
@@ -44,10 +45,12 @@ class RenderingOptions(Options):
         "night), or each colour likewise (colours)",
     )
     max_references: int = Field(
-        default=4, gt=0, description="number of reference images with depth"
+        default=4, gt=0, description="largest number of reference images with depth"
     )
     max_points: int = Field(
-        default=12000, ge=MIN_POINTS, description="number of points per reference and pyramid level"
+        default=12000,
+        ge=MIN_POINTS,
+        description="largest number of points per reference and pyramid level",
     )
     max_side_px: int = Field(
         default=640, ge=64, description="longer side of the finest level; larger images are reduced"
@@ -63,7 +66,7 @@ class RenderingOptions(Options):
     max_rotation_deg: float = Field(default=5.0, gt=0, description="largest accepted rotation")
     require_consistent_map: bool = Field(
         default=True,
-        description="refine only in maps whose held-out images keep their poses under refinement",
+        description="refine only if held-out map images, when refined, keep their poses",
     )
     accept_always: bool = Field(
         default=False,
@@ -73,7 +76,7 @@ class RenderingOptions(Options):
     min_significance: float = Field(
         default=2.5,
         ge=0,
-        description="smallest fall of the robust cost, in standard errors over parts of the query",
+        description="smallest accepted decrease of the robust cost, in standard errors",
     )
     min_correlation: float = Field(
         default=0.12,
@@ -82,18 +85,17 @@ class RenderingOptions(Options):
         description="smallest accepted correlation of the query with the warped references",
     )
     min_overlap: float = Field(
-        default=0.2, ge=0, le=1, description="share of the query that references must cover"
+        default=0.2, ge=0, le=1, description="share of the query that the references must cover"
     )
     max_overlap_loss: float = Field(
-        default=0.1, ge=0, le=1, description="share of that overlap that a new pose may lose"
+        default=0.1, ge=0, le=1, description="share of this overlap that the new pose may lose"
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    # problem: at the finest level, with all points and without occluded cells
-    problem: LevelProblem
-    free: LevelProblem
+    problem: LevelProblem  # with all points of the level
+    free: LevelProblem  # without occluded cells
     alignment: Alignment
 
 
@@ -103,7 +105,7 @@ def accept_or_keep(
     overlaps: tuple[float, float],
     options: RenderingOptions,
 ) -> PoseRefinement:
-    """Return the new pose with its covariance, or the old one and the reason."""
+    """Return the new pose with its covariance, or the old pose with the reason for keeping it."""
     pose = candidate.alignment.cam_from_world
     comparison = compare_poses(candidate.problem, start, pose)
     moved_m, turned_deg = movement(start, pose)
@@ -134,13 +136,16 @@ def accept_or_keep(
     if uncertainty is None:
         return PoseRefinement(start, "the images do not determine the pose", measures)
     if measures["moved_px"] < _LEAST_PX or not measures["squared_distance"] > CHI2_OF_CHANCE:
-        return PoseRefinement(start, "it is as near as the images can tell", measures)
+        return PoseRefinement(
+            start, "the images do not distinguish it from the refined pose", measures
+        )
     return PoseRefinement(pose, "", measures, uncertainty)
 
 
 def squared_distance(
     old: RigidTransform, new: RigidTransform, covariance: NDArray[np.float64]
 ) -> float:
+    """Return the squared Mahalanobis distance of two poses; the covariance is that of ``Pose``."""
     old_from_new = old @ new.inverse()
     w, x, y, z = old_from_new.quat_wxyz
     turn = 2.0 * np.copysign(1.0, w) * np.array([x, y, z])
@@ -174,12 +179,12 @@ def _no_better(
         return f"only {after.count} points are seen from both poses"
     if after.correlation < options.min_correlation:
         return (
-            f"references and query correlate by {after.correlation:.2f}, "
+            f"the correlation of references and query is {after.correlation:.2f}, "
             f"less than {options.min_correlation:g}"
         )
     if significance < options.min_significance:
         return (
-            f"the cost improves by {significance:.1f} of its standard errors, "
+            f"the cost decreases by {significance:.1f} standard errors, "
             f"less than {options.min_significance:g}"
         )
     if overlaps[1] < (1.0 - options.max_overlap_loss) * overlaps[0]:
@@ -202,7 +207,7 @@ class Comparison:
 
 
 def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> Comparison:
-    """Compare two poses on the points visible under both."""
+    """Compare the costs of two poses over the points that both see."""
     aligned = [problem.nuisance_at(pose) for pose in (old, new)]
     rows = [problem.rows(at) for at in aligned]
     hidden = np.isnan(rows[0][:, 0, 0]) | np.isnan(rows[1][:, 0, 0])
@@ -211,7 +216,7 @@ def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransfor
     deviation = aligned[1].deviation
     gained = _losses(rows[0][~hidden], deviation) - _losses(rows[1][~hidden], deviation)
     before, after = (_fit(problem, each, deviation) for each in rows)
-    # sum of the gains over its standard error, for independent cells of mean 0
+    # sum of the gains divided by its standard error, if cells are independent and have mean 0
     sums = np.bincount(problem.cells(new, ~hidden), gained)
     error = float(np.sqrt(np.square(sums).sum()))
     return Comparison(before, after, float(sums.sum()) / error if error > 0 else 0.0)
@@ -236,27 +241,27 @@ def _fit(problem: LevelProblem, rows: Float64, deviation: float) -> Fit:
 def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:
     seen = ~np.isnan(rows[:, 0, 0])
     query, reference, groups = rows[seen][..., 7], chosen.values[seen], chosen.groups[seen]
-    together = apart_query = apart_reference = 0.0
+    product, query_square, reference_square = 0.0, 0.0, 0.0
     for group in range(num_groups):
         ours = groups == group
         if not ours.any():
             continue
         a = query[ours] - query[ours].mean(0)
         b = reference[ours] - reference[ours].mean(0)
-        together += float((a * b).sum())
-        apart_query += float((a * a).sum())
-        apart_reference += float((b * b).sum())
-    product = apart_query * apart_reference
-    return together / float(np.sqrt(product)) if product > 0 else 0.0
+        product += float((a * b).sum())
+        query_square += float((a * a).sum())
+        reference_square += float((b * b).sum())
+    squares = query_square * reference_square
+    return product / float(np.sqrt(squares)) if squares > 0 else 0.0
 
 
 def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:
-    """Estimate the covariance (6, 6) of the pose, as in ``Pose``; None where it is undetermined.
+    """Estimate the pose covariance (6, 6), as in ``Pose``; None if the pose is undetermined.
 
-    A sandwich estimate clustered by cells of the query (Liang and Zeger, Biometrika 1986), so that
-    correlated residuals enlarge it. It uses the objective's curvature rather than the normal
-    equations, in which the query's noise counts as gradient. Errors shared by the whole image (map
-    poses, depth, calibration) are not included.
+    The sandwich estimate is clustered by cells of the query, so that correlated residuals enlarge
+    it (Liang and Zeger, Biometrika 1986). It uses the curvature of the objective because the normal
+    equations count the query's noise as gradient. Errors shared by the whole image (map poses,
+    depth, calibration) are not included.
     """
     rows = problem.rows(at)
     scale2 = max(at.squared_scale, 1e-24)
@@ -274,11 +279,11 @@ def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:
 def _scatter(
     problem: LevelProblem, at: Alignment, rows: Float64, squared_scale: float, projection: Float64
 ) -> Float64 | None:
-    """Return the squared scores (6, 6) of the cells; None for too few cells."""
+    """Return the sum of outer products (6, 6) of the cells' scores; None for too few cells."""
     seen = ~np.isnan(rows[:, 0, 0])
     rows, groups = rows[seen], problem.chosen.groups[seen]
     weight = (1.0 + np.square(rows[..., 0]).mean(1) / squared_scale) ** -2 / rows.shape[1]
-    # total derivative by the pose: gain and bias follow it
+    # total derivative with respect to the pose, with gain and bias eliminated
     nuisance = np.stack([rows[..., 7], np.ones(rows.shape[:2])], axis=-1)
     derivative = rows[..., 1:7] - np.einsum("ncpi,nci->ncp", projection[groups], nuisance)
     score = np.einsum("n,nc,ncp->np", weight, rows[..., 0], derivative)
@@ -297,8 +302,8 @@ def _inverse_curvature(
         return None
     steps, change = whitened
     weights = float(system.own[..., 2].sum())
-    nearer = min(1.0, (_CHANGE * at.deviation) ** 2 * weights / change)
-    steps, change = steps * np.sqrt(nearer), change * nearer
+    shrink = min(1.0, (_CHANGE * at.deviation) ** 2 * weights / change)
+    steps, change = steps * np.sqrt(shrink), change * shrink
     columns = []
     for step in steps.T:
         ends = []
@@ -320,10 +325,10 @@ def _inverse_curvature(
 def whitened_directions(
     problem: LevelProblem, system: NormalEquations
 ) -> tuple[Float64, float] | None:
-    """Return steps of the pose (6, 6), in columns, that whiten the normal equations.
+    """Return pose steps (6, 6), in columns, that whiten the normal equations.
 
-    Each is half a pixel of the level, the least determined direction first. Returns also each
-    step's change of the weighted sum of squared residuals.
+    Steps move points by about half a pixel of the level; the least determined direction is first.
+    Also returns the change of the weighted sum of squared residuals, the same for every step.
     """
     reduced = system.reduced()
     if reduced is None:
@@ -338,13 +343,13 @@ def whitened_directions(
 
 
 def perturbed_starts(problem: LevelProblem, at: Alignment) -> list[Alignment]:
-    """Return alignments perturbed along the two least determined directions, best first."""
+    """Return alignments perturbed along the two least determined directions, lowest cost first."""
     scale2 = at.squared_scale
     whitened = whitened_directions(problem, problem.system_at(at, scale2)) if scale2 > 0 else None
     if whitened is None:
         return []
     first, second = whitened[0][:, 0], whitened[0][:, 1]
-    steps = [a * first + b * second for a in _BESIDE for b in _BESIDE if a or b]
+    steps = [a * first + b * second for a in _START_STEPS for b in _START_STEPS if a or b]
     others = [replace(at, cam_from_world=perturbed(at.cam_from_world, step)) for step in steps]
     costs = [problem.system_at(each, scale2).mean_cost for each in others]
     return [others[k] for k in np.argsort(costs, kind="stable")]

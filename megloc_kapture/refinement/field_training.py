@@ -75,7 +75,7 @@ class FieldTrainingOptions(NetworkOptions):
 
 
 class FieldTrainer:
-    """Trainer of a field on ``views``; every ``held_out_every``-th view is held out."""
+    """Trainer of a field on ``views``, of which every ``held_out_every``-th is held out."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class FieldTrainer:
         content = load_state(state, path, self._field.module, self._optimizer)
         if content.get("training") != self._fingerprint:
             raise DataError(
-                "is from a training with other options or images; -f starts over", path=path
+                "belongs to a training with other options or images; -f starts over", path=path
             )
         self._step, self._seconds = content["step"], float(content["seconds"])
 
@@ -253,7 +253,7 @@ class _Pixels:
             of_camera = camera_of == number
             camera = self._cameras[number]
             y, x = np.divmod(rows[of_camera] - self._starts[image[of_camera]], camera.width)
-            # rays of these pixels only: a map may have as many cameras as images
+            # compute rays of these pixels only, since a map may have as many cameras as images
             rays[of_camera] = bearing_rays(camera, np.stack([x + 0.5, y + 0.5], axis=1))
         return image, np.einsum("nj,njk->nk", rays, self._rotations[image])
 

@@ -1,8 +1,8 @@
 """Refinement of query poses by depth alone: the plugin ``icp``.
 
-The query's cloud is fitted to the map's, point to plane and coarse to fine. Since it may slide
-along a wall or fit the wrong one, the new pose is accepted only if it explains the query better,
-lies nearby and is determined in every direction.
+The query's point cloud is fitted to the map's, point to plane and coarse to fine. Since it may
+slide along a wall or fit the wrong wall, the new pose is accepted only if it explains the query
+better, is near the old pose and is determined in every direction.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
 
-# query pixels in the last step: more cost time without effect
+# query pixels in the last step; more take longer but have no effect
 _MAX_PIXELS = 10000
-# pixel step of a reference's depth map for its overlap
+# sampling step in a reference's depth map to measure its overlap
 _OVERLAP_STEP_PX = 8
-# views this close count as one: a depth sensor's errors depend on the position in its image, and
-# only those of different views average out
+# views this close count as one: the errors of a depth sensor depend on the position in the image,
+# so they average out only over different views
 _SAME_VIEW_M, _SAME_VIEW_DEG = 0.2, 10.0
 
 
@@ -55,8 +55,7 @@ class IcpOptions(Options):
     """Options of the refinement by ICP.
 
     The finest distance is three standard deviations of a structured-light sensor's depth at the end
-    of its range: 0.0012 + 0.0019 (z - 0.4)^2, Nguyen, Izadi and Lovell, Modeling Kinect Sensor
-    Noise for Improved 3D Reconstruction and Tracking, 3DIMPVT 2012, eq. 4.
+    of its range, 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et al., 3DIMPVT 2012, eq. 4).
     """
 
     voxels_m: tuple[float, ...] = Field(
@@ -81,7 +80,8 @@ class IcpOptions(Options):
     max_references: int = Field(
         default=10,
         gt=0,
-        description="number of map depth maps: those that overlap most, one of similar views",
+        description="largest number of map images with depth: those that overlap most, without "
+        "similar views",
     )
     accept_always: bool = Field(
         default=False,
@@ -97,8 +97,8 @@ class IcpOptions(Options):
         default=0.5,
         ge=0,
         le=1,
-        description="smallest share of the query's points that lie on the map after refinement, "
-        "and within the coarsest distance before",
+        description="smallest share of the query's points on the map after refinement, and within "
+        "the coarsest distance before it",
     )
     max_moved_m: float = Field(
         default=0.3, gt=0, description="largest accepted movement of the centre, metres"
@@ -119,7 +119,7 @@ class IcpOptions(Options):
         for name in ("voxels_m", "max_distances_m"):
             values = getattr(self, name)
             if min(values) <= 0 or list(values) != sorted(values, reverse=True):
-                raise ValueError(f"{name} must be positive, and fall: {values}")
+                raise ValueError(f"{name} must be positive and decreasing: {values}")
         if len(self.voxels_m) != len(self.max_distances_m):
             raise ValueError("voxels_m and max_distances_m must have the same number of levels")
         if (depth_noise(np.linspace(0.0, self.depth.max_depth_m, 256), self.noise) <= 0).any():
@@ -144,22 +144,22 @@ def refine_by_icp(
     cam_from_world: RigidTransform,
     options: IcpOptions | None = None,
 ) -> PoseRefinement:
-    """Fit a query's cloud, float64 (N, 3) in the camera's frame, to the map's (M, 3), in metres.
+    """Fit a query's points (N, 3), in the camera frame, to the map's (M, 3), float64 in metres.
 
-    Residuals are median distances from the map's planes within the coarsest distance, overlaps the
-    shares of points within the finest one.
+    ``measures`` of the result: residuals are median distances from the map's planes within the
+    coarsest distance; overlaps are the shares of points within the finest distance.
     """
     options = options or IcpOptions()
-    # coordinates are small near the camera, whatever the world's origin
+    # move the origin to the camera, so that coordinates are small
     center = cam_from_world.center()
     local_from_cam = RigidTransform(cam_from_world.inverse().quat_wxyz, (0.0, 0.0, 0.0))
     fine_points = downsample(query_points, options.voxels_m[-1])
     fine_map = downsample(map_points - center, options.voxels_m[-1])
     if len(fine_points) < options.min_points:
-        reason = f"the query's depth has {len(fine_points)} points only"
+        reason = f"the query's depth has only {len(fine_points)} points"
         return PoseRefinement(cam_from_world, reason)
     if len(fine_map) < options.min_points:
-        return PoseRefinement(cam_from_world, f"the map has {len(fine_map)} points here only")
+        return PoseRefinement(cam_from_world, f"the map has only {len(fine_map)} points here")
     coarser = zip(options.voxels_m[:-1], options.max_distances_m[:-1], strict=True)
     levels = [
         _Level(surface_of(downsample(fine_map, voxel_m)), downsample(fine_points, voxel_m), limit_m)
@@ -175,7 +175,7 @@ def refine_by_icp(
     if reason:
         return PoseRefinement(cam_from_world, reason, measures)
     after = levels[-1].fit(moved, options)
-    # noisy normals of the finest level look like structure on a bare wall
+    # use the coarsest level: on a bare wall, the noisy normals of the finest look like structure
     condition = condition_number(levels[0].fit(moved, options))
     moved_m, moved_deg = _movement(local_from_cam, moved)
     measures |= {
@@ -202,7 +202,7 @@ def _reason_to_skip(
     spacing, limit = levels[-1].surface.spacing(), options.max_distances_m[-1]
     if spacing > limit:
         return (
-            f"the map is too sparse here: {NORMAL_NEIGHBOURS} points take {spacing:.3f} m, "
+            f"the map is too sparse here: {NORMAL_NEIGHBOURS} points span {spacing:.3f} m, "
             f"at most {limit:g} m is allowed"
         )
     reach = levels[0].fit(local_from_cam, options).reach
@@ -221,7 +221,7 @@ def _fit_levels(
     for level in levels:
         fitted = fit_to_surface(level.surface, level.points, moved, level.max_distance_m)
         if fitted is None:
-            return start, "no point of the map is near the query's"
+            return start, "no point of the map is near the query's points"
         moved = fitted
         if reason := _reason_too_far(start, moved, options):
             return start, reason
@@ -289,8 +289,8 @@ def map_cloud(
 ) -> Floats:
     """Return the map's points (M, 3) around a query under its estimated pose.
 
-    They come from the depth maps of the references with most overlap, one per view within 0.2 m and
-    10 deg, or from the references' sparse points without depth.
+    They come from the depth maps of the references with most overlap, of which none are within
+    0.2 m and 10 deg of each other. Without depth maps they are the references' sparse points.
     """
     margin_m = options.max_distances_m[0]
     low, high = query_points.min(axis=0) - margin_m, query_points.max(axis=0) + margin_m
@@ -312,7 +312,7 @@ def map_cloud(
         points = depth_cloud(
             view, options.depth, image_camera=camera, image_mask=mask, step_px=step_px
         )
-        # one vote per image and voxel: a near image has more pixels but is no more reliable
+        # thin per image, since a near image has more pixels per voxel but is no more reliable
         clouds.append(downsample(cropped(scene.map_pose(name).inverse().apply(points)), voxel_m))
     return np.concatenate(clouds)
 
@@ -368,7 +368,7 @@ def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDA
 
 
 class Icp:
-    """Plugin ``icp``: the query's depth against the map's depth, or against its points if dense."""
+    """Plugin ``icp``, which fits the query's depth to the map's depth, or to its dense points."""
 
     name = "icp"
     Options = IcpOptions
@@ -390,6 +390,6 @@ class Icp:
         mask = scene.query_mask(query)
         points = depth_cloud(view, options.depth, image_camera=camera, image_mask=mask)
         if not len(points):
-            return PoseRefinement(cam_from_world, "the query's depth has 0 points only")
+            return PoseRefinement(cam_from_world, "the query's depth has no usable points")
         cloud = map_cloud(view, points, cam_from_world, references, scene, options)
         return refine_by_icp(points, cloud, cam_from_world, options)

@@ -1,6 +1,6 @@
 """Point clouds and surfaces for ICP: points from depth maps, normals and fits.
 
-The adapter of small_gicp runs with one thread: its voxel grid is not deterministic with more.
+small_gicp runs in one thread because its voxel grid is not deterministic with more.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NORMAL_NEIGHBOURS = 20  # small_gicp's default
 _MAX_ITERATIONS = 20
 _ROTATION_EPSILON_RAD = 1e-4
 _TRANSLATION_EPSILON_M = 1e-4
-_CONVERGED = 5e-5  # radians and metres: a hundredth of the required accuracy
+_CONVERGED = 5e-5  # convergence in radians and metres, a hundredth of the required accuracy
 # Cauchy scale with 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
 
@@ -57,8 +57,8 @@ def depth_cloud(
 ) -> Floats:
     """Return the points (N, 3) of a depth map in the frame of its image, in metres.
 
-    Pixels are dropped that have no depth or too large a depth, are at depth edges (sensors smear
-    them: Khoshelham and Elberink, Sensors 12(2), 2012) or are masked in the image.
+    Pixels are dropped if their depth is unknown or too large, if they are at depth edges, which
+    sensors smear (Khoshelham and Elberink, Sensors 12(2), 2012), or if the image is masked there.
     """
     options = options or DepthCloudOptions()
     depth = np.asarray(view.depth_m, np.float32)
@@ -85,7 +85,7 @@ def _on_edge(
     with np.errstate(invalid="ignore"):
         for down, right in product((0, 1, 2), (0, 1, 2)):
             other = padded[down : down + height, right : right + width][sampled]
-            # pixels without depth (0, NaN) are no edges
+            # pixels without depth (0, NaN) do not count as edges
             edge |= (other > limit * z) | ((other > 0) & (limit * other < z))
     return edge
 
@@ -127,7 +127,7 @@ def downsample(points: Floats, voxel_m: float) -> Floats:
 
 
 def surface_of(points: Floats) -> Surface:
-    """Estimate the surface through points (N, 3); they must be near the origin."""
+    """Estimate the surface through points (N, 3), which must be near the origin."""
     cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
     tree = small_gicp.KdTree(cloud)
     small_gicp.estimate_normals(cloud, tree, min(NORMAL_NEIGHBOURS, len(points)))
@@ -227,9 +227,9 @@ def fit_weighted(
     surface_from_points: RigidTransform,
     max_distance_m: float,
 ) -> RigidTransform | None:
-    """Refine a fit of points (N, 3) to a nearby surface, point to plane, weighted by noise (N,).
+    """Refine a point-to-plane fit of points (N, 3) to a nearby surface, weighted by noise (N,).
 
-    Gauss-Newton with a Cauchy loss. Return None with fewer than six points within
+    It minimises a Cauchy loss by Gauss-Newton. Returns None with fewer than six points within
     ``max_distance_m``, or if the transform is undetermined.
     """
     transform = surface_from_points
@@ -246,7 +246,7 @@ def fit_weighted(
         if scale == 0:
             return transform
         weights = 1.0 / (1.0 + (relative / (_CAUCHY_EFFICIENT * scale)) ** 2) / noise[near] ** 2
-        # at the origin of the points, rotation and translation are nearly uncorrelated
+        # rotation about the centroid is nearly uncorrelated with translation
         origin = np.array(transform.translation)
         jacobian = np.column_stack([np.cross(transformed - origin, normals), normals])
         weighted = jacobian * weights[:, None]

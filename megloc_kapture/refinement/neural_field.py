@@ -1,7 +1,7 @@
 """Radiance field of a map, which renders colour and depth from any pose.
 
-Trained by :mod:`~megloc_kapture.refinement.field_training`. As in NeRF-W's evaluation, the
-appearance of a held-out image is fitted on its left half, and the error measured on its right.
+It is trained by :mod:`~megloc_kapture.refinement.field_training`. As in NeRF-W's evaluation, the
+appearance of a held-out image is fitted to its left half, and the error is that of its right half.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ Kind = Literal["triplane", "nerfw"]
 FieldModule = NerfW | TriPlane
 Lights = Literal["image", "folder"]
 Floats = NDArray[np.float32]
-# rays rendered at once: on a GPU two gigabytes, on a CPU their samples fit its cache
+# rays rendered at once: they take two gigabytes on a GPU; on a CPU their samples fit the cache
 _CHUNK, _CPU_CHUNK = 4096, 512
-# fit of an appearance: Adam's rate, steps, rays per step, and rays to draw from
+# fit of an appearance embedding: Adam's rate, steps, rays per step, and rays to draw from
 _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
 
 
@@ -68,7 +68,7 @@ class FieldRendering:
     image: NDArray[np.uint8]  # uint8 (H, W, 3), RGB
     # float32 (H, W) along the optical axis, unit of the map; 0 where mostly empty
     depth_m: Floats
-    camera: Camera  # reduced camera of the view
+    camera: Camera  # the view's camera at reduced size
 
 
 def build_field(kind: Kind, num_images: int, num_lights: int) -> FieldModule:

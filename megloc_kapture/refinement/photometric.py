@@ -2,9 +2,9 @@
 
 At each pyramid level, coarse to fine, the residuals ``gain_i I(px(T X)) + bias_i - r`` of all
 references i are minimised over the pose T and a gain and a bias per reference and channel, by
-Levenberg-Marquardt. With gain and bias on the query's side this maximises correlation, as ECC does
-(Evangelidis and Psarakis, PAMI 2008). The loss is Geman and McClure's, with a scale from the
-residuals. Gains and biases are eliminated by Schur's complement, which leaves six unknowns.
+Levenberg-Marquardt. Since gain and bias apply to the query, this maximises correlation, as ECC does
+(Evangelidis and Psarakis, PAMI 2008). The loss is Geman-McClure's, with a scale from the residuals.
+The Schur complement eliminates gains and biases, which leaves six unknowns.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ _MAX_STEPS = 12
 _LAST_GAIN = 1e-5
 _DAMPING = 1e-3
 _MOST_DAMPING = 1e2
-# least points to judge a cell's correlation, and its least correlation as a share of a good cell's
+# smallest number of points for a cell's correlation, and smallest share that an unoccluded cell has
+# of a good cell's correlation
 _CELL_POINTS = 20
 _AGREES = 0.5
 
@@ -63,8 +64,8 @@ class Alignment:
 class LevelProblem:
     """Residuals of chosen points at one level of the query, as functions of the pose.
 
-    ``near``: pose that gives the distance of the points; ``num_groups`` includes references without
-    points.
+    ``near`` is a pose that gives the distance of the points; ``num_groups`` counts references,
+    including those without points.
     """
 
     def __init__(
@@ -189,7 +190,7 @@ class NormalEquations:
         return cls(pose, mixed, own, pose_gradient, own_gradient, cost / max(count, 1), count)
 
     def reduced(self, damping: float = 0.0) -> tuple[Float64, Float64, Float64] | None:
-        # keeps the block of an invisible reference invertible
+        # the ridge keeps the block of an invisible reference invertible
         gain, bias = _solve_pairs(self.own[:, :, None], self.mixed)
         projection = np.stack([gain, bias], axis=-1)
         matrix = self.pose - np.einsum("gcpi,gcqi->pq", projection, self.mixed)
@@ -226,7 +227,10 @@ def empty_sums(num_groups: int, channels: int) -> tuple[Float64, ...]:
 
 
 def _solve_pairs(own: Float64, right: Float64) -> tuple[Float64, Float64]:
-    """Solve 2x2 systems (gain gain, gain bias, bias bias) with a ridge: (..., 3); (..., 2)."""
+    """Solve 2x2 systems (..., 3) for right sides (..., 2), with a ridge.
+
+    Systems are stored as gain gain, gain bias, bias bias.
+    """
     first, cross, second = np.moveaxis(own, -1, 0)
     ridge = 1e-9 * (first + second) + 1e-12
     first, second = first + ridge, second + ridge
@@ -263,7 +267,7 @@ def _levenberg_marquardt(problem: LevelProblem, at: Alignment, last_step_px: flo
         pose_step, gain_step, bias_step = step
         trial = at.moved(perturbed(at.cam_from_world, pose_step), gain_step, bias_step)
         new = problem.system_at(trial, scale2)
-        # means, so that points leaving the image have no effect
+        # compare means, so that points that leave the image have no effect
         small = float(np.abs(pose_step) @ reach) < last_step_px
         if new.count >= MIN_POINTS and new.mean_cost < system.mean_cost:
             small = small or new.mean_cost > (1.0 - _LAST_GAIN) * system.mean_cost

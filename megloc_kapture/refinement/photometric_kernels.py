@@ -1,4 +1,4 @@
-"""Compiled loops of photometric alignment; import only when needed, since numba is slow to load.
+"""Compiled loops of photometric alignment; import only when needed, as numba loads slowly.
 
 A residual is ``gain I(px) + bias - r`` of a point with reference value r; the query level I is
 interpolated bilinearly, and the derivatives are exact for that interpolation.
@@ -38,7 +38,7 @@ def camera_of(camera: Camera) -> tuple[int, NDArray[np.float64], float]:
 def _project(camera, r, t, points, shown_at):
     """Project points by the pose; fill camera coordinates, px, py and the derivatives of both.
 
-    The viewing angle is limited: a distortion polynomial may lead back into the image.
+    The viewing angle is limited because a distortion polynomial may fold back into the image.
     """
     model, p, reach2 = camera
     for k in range(len(points)):
@@ -70,7 +70,10 @@ def _project(camera, r, t, points, shown_at):
 
 @compiled_loop
 def _corner(valid, x, y):
-    """Return row and column of the upper left of four pixels, -1 if invalid, and the offset."""
+    """Return row and column of the upper left of the four pixels around a position, and its offset.
+
+    They are -1 if a pixel is invalid.
+    """
     h, w = valid.shape
     # false for NaN too
     if x >= 0.0 and y >= 0.0 and x < w - 1 and y < h - 1:
@@ -209,7 +212,7 @@ def evaluated_equations(chosen, query, alignment, squared_scale, sums):
 
 @compiled_loop
 def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths):
-    """Put points (N, 3) into cells of an image and keep each cell's smallest depth in ``nearest``.
+    """Assign points (N, 3) to cells of an image; keep each cell's smallest depth in ``nearest``.
 
     ``cells`` and ``depths`` (N,) are filled with flat cell indices, -1 outside, and depths.
     """
@@ -233,7 +236,7 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
 
 @compiled_loop
 def strongest_per_cell(x, y, energy, wanted, cell_px, best):
-    """Find the wanted point with the largest ``energy`` (h, w) in each cell of a level.
+    """Find the point with the largest ``energy`` (h, w) in each cell of a level.
 
     ``x`` and ``y`` (N,) are pixels of the level. ``best`` is filled with point indices, -1 for zero
     energy.

@@ -1,7 +1,7 @@
 """Image pyramids and depth points for photometric alignment.
 
-A reference is compared at pixels of its depth map, those with the strongest gradient per grid cell
-(Engel et al., "Direct Sparse Odometry", PAMI 2018, section 3.2). Masked pixels never enter a mean
+A reference is compared at those pixels of its depth map that have the strongest gradient per grid
+cell (Engel et al., "Direct Sparse Odometry", PAMI 2018, section 3.2). Means exclude masked pixels
 (normalised convolution, Knutsson and Westin, CVPR 1993).
 """
 
@@ -23,20 +23,20 @@ from megloc_kapture.values import Camera, RigidTransform
 
 # depth samples along the longer side of a depth map; about four per point
 _GRID = 320
-# relative second difference of inverse depth at an edge; zero on planes
+# a larger relative second difference of inverse depth is an edge; on planes it is zero
 _JUMP = 0.05
 # cells of the visibility buffer along an image's longer side
 _CELLS = 80
-# relative depth margin of occlusion; slanted ground varies as much within a cell
+# points behind a cell's nearest by more than this share are occluded; slanted ground varies as much
 _HIDES = 0.15
 Float64 = NDArray[np.float64]
 Appearance = Literal["normalised", "colours"]
-_BLUR_PX = 0.8  # before each halving; bilinear interpolation needs smooth values
+_BLUR_PX = 0.8  # Gaussian sigma on every level; bilinear interpolation needs smooth values
 _WINDOW_PX = 17
-# share of the mean local variance added to local variances: flat areas stay flat
+# share of the mean local variance that is added to local variances, so that flat areas stay flat
 _FLAT = 0.1
 _SMALLEST_SIDE_PX = 16
-_HALF = 0.5  # least used share of a pixel
+_HALF = 0.5  # a pixel of a level is valid if more than this share of it is unmasked
 Float32 = NDArray[np.float32]
 
 
@@ -56,7 +56,7 @@ class Visibility:
 
 
 def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
-    """Lift the depth map's points that its image sees, without those on depth edges."""
+    """Lift those points of a depth map that its image sees and that are not on depth edges."""
     if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
         raise DataError(
             f"a depth map of {depth.depth_m.shape} does not fit a camera of "
@@ -140,8 +140,8 @@ def _grid(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64
 class Level:
     values: Float32  # float32 (h, w, C)
     valid: NDArray[np.bool_]  # bool (h, w)
-    # pixels of the level per pixel of the image: pixel (u, v), the first centre at (0.5, 0.5), is
-    # at (u scale_x, v scale_y)
+    # pixels of the level per pixel of the image: (u, v) is at (u scale_x, v scale_y) of the level,
+    # with the first pixel's centre at (0.5, 0.5) in both
     scale_x: float
     scale_y: float
 
@@ -166,10 +166,10 @@ def build_pyramid(
     max_side_px: int = 640,
     appearance: Appearance = "normalised",
 ) -> list[Level]:
-    """Build the levels of an RGB image, finest first; none is smaller than 16 px.
+    """Build the levels of an RGB image, finest first; sides of coarser levels are at least 16 px.
 
-    ``normalised`` is brightness of zero mean and unit deviation in a window around each pixel,
-    ``colours`` the same of red, green and blue.
+    ``normalised`` is brightness with zero mean and unit deviation in a window around each pixel,
+    ``colours`` are red, green and blue normalised likewise.
     """
     height, width = image.shape[:2]
     if mask is not None and mask.shape != (height, width):
@@ -217,7 +217,7 @@ def _normalised(plane: Float32, used: Float32) -> Float32:
     share = np.maximum(_box_mean(used), np.float32(1e-3))
     mean = _box_mean(plane * used) / share
     centred = np.asarray(plane - mean, np.float32)
-    # about the pixel's own mean, close to that of its neighbours
+    # deviations are from each pixel's own window mean, which is close to its neighbours'
     variance = _box_mean(centred * centred * used) / share
     floor = _FLAT * float(np.average(variance, weights=used)) if used.any() else 0.0
     result = centred / np.sqrt(variance + np.float32(max(floor, 1e-8)))
@@ -244,7 +244,7 @@ def choose_points(
     wanted: Sequence[NDArray[np.bool_]],
     max_points: int,
 ) -> ChosenPoints:
-    """Choose at most ``max_points`` of each reference, evenly spread, with their values."""
+    """Choose about ``max_points`` evenly spread points of each reference, with their values."""
     from megloc_kapture.refinement.photometric_kernels import read_values, strongest_per_cell
 
     points, values, groups = [], [], []

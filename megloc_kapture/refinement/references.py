@@ -1,9 +1,9 @@
 """Reference images for refinement by rendering: selection, preparation, map consistency.
 
 Consistency is tested by leave-one-out refinement of map images (Stone, JRSS B 1974) against images
-with another viewing angle. An image contradicts the map if its displacement exceeds the claimed
-covariance, the acceptance limit and the resolution of alignment; errors shared by all images are
-not detected.
+with another viewing angle. An image contradicts the map if its displacement is significant by the
+claimed covariance and exceeds the resolution of alignment. Errors that all images share are not
+detected.
 """
 
 from __future__ import annotations
@@ -30,22 +30,23 @@ from megloc_kapture.refinement.pyramid import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
-# numbers of held-out images: displacements that suffice, displacements required (all five are on
-# the wrong side of the true median with a chance of 1 in 32), and images tried
+# held-out images: largest and smallest number of displacements (five are all above the true median
+# with a chance of 1 in 32), and number of images tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
-# baseline over distance of the surfaces: an angle of about 6 deg between views
+# smallest ratio of baseline to surface distance: an angle of about 6 deg between views
 _MIN_PARALLAX = 0.1
-# candidate references: nearest images, of which the overlap is bounded, and those of largest
-# bound, of which the overlap is measured
+# candidate references: the overlap is bounded for the nearest images, and measured for those with
+# the largest bounds
 _NEAREST, _BEST = 200, 6
 _ASKED_POINTS = 300
 _MIN_SHARED = 0.1
-# pixels of the finest level: alignments converge to 0.01 px, and exact images move by up to 0.02 px
+# smallest displacement that alignment resolves, in pixels of the finest level: it converges to
+# 0.01 px, and images with exact poses move by up to 0.02 px
 _RESOLVED_PX = 0.05
 
 
 class ReferenceImages:
-    """Index of map images by ``cam_from_world``, for those that may overlap with a camera."""
+    """Index of map images by ``cam_from_world``, to find those that may overlap with a camera."""
 
     def __init__(self, poses: Mapping[str, RigidTransform]) -> None:
         self.names = tuple(sorted(poses))
@@ -65,7 +66,7 @@ class ReferenceImages:
     ) -> list[str]:
         """Return images with a similar viewing direction, preferably half of them from ``first``.
 
-        Each half is ordered by distance. ``first`` are images with matches; ``only_first`` excludes
+        Each half is sorted by distance. ``first`` are images with matches; ``only_first`` excludes
         all others.
         """
         forward = cam_from_world.rotation_matrix()[2]
@@ -91,7 +92,7 @@ class RenderingQuery:
 
 @dataclass(frozen=True, eq=False)
 class RenderingReference:
-    """A map image to warp into the query, with depth that may be from another camera."""
+    """A map image to warp into the query, with a depth map that may be from another camera."""
 
     image: NDArray[np.uint8]
     camera: Camera
@@ -139,7 +140,7 @@ class Displacement:
     # claimed_m, claimed_deg: standard deviations by the claimed covariance
     claimed_m: float
     claimed_deg: float
-    squared_distance: float  # Mahalanobis, by that covariance; six degrees of freedom
+    squared_distance: float  # squared Mahalanobis distance by this covariance
 
     @property
     def contradicts(self) -> bool:
@@ -150,9 +151,9 @@ class Displacement:
 class Consistency:
     images: int
     contradicting: int
-    # per component; None if no image was tested
+    # median of each component; None if no image was tested
     median: Displacement | None
-    reason: str  # of inconsistency; empty if consistent
+    reason: str  # why the map is inconsistent; empty if it is consistent
 
     @property
     def consistent(self) -> bool:
@@ -200,14 +201,14 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
     reason = ""
     if len(known) < MIN_TESTED:
         reason = (
-            f"the map's consistency is not known: {len(known)} of its images overlap with "
+            f"the map's consistency is unknown: {len(known)} of its images overlap with "
             f"images from other viewpoints, at least {MIN_TESTED} are needed"
         )
     elif 2 * contradicting > len(known):
         reason = (
             f"the map contradicts itself: {contradicting} of {len(known)} held-out images would "
-            f"move by more than their uncertainty, all of them by {median.moved_m:.3f} m, "
-            f"{median.turned_deg:.2f} deg, {median.moved_px:.1f} px (medians)"
+            f"move by more than their uncertainty; the median motion is {median.moved_m:.3f} m, "
+            f"{median.turned_deg:.2f} deg, {median.moved_px:.1f} px"
         )
     return Consistency(len(known), contradicting, median, reason)
 

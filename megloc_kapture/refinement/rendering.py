@@ -1,4 +1,4 @@
-"""Pose refinement by rendering: reference images are warped into the query by their depth.
+"""Pose refinement by rendering: depth maps warp reference images into the query.
 
 :mod:`megloc_kapture.refinement.photometric` aligns them, and
 :mod:`megloc_kapture.refinement.acceptance` accepts or rejects the result. Alignment converges only
@@ -47,11 +47,11 @@ from megloc_kapture.refinement.references import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _MAX_STARTS, _START_POINTS = 5, 2500
-# a step this small, in pixels of the level, ends alignment: at the finest level, and at the others
+# alignment ends with a step this small, in pixels: at the finest level, and at the other levels
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
 # pixels of a level per chosen point, and points of a reference on coarse levels
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
-# decrease of the cost, in standard errors, above which the unperturbed start is not tried
+# if a perturbed start decreases the cost by more standard errors, the unperturbed is not tried
 _CLEAR = 4.0
 
 
@@ -81,7 +81,7 @@ def judge_by_rendering(
 ) -> PoseRefinement:
     """Judge a pose from another method, after alignment at the finest level.
 
-    ``judged``: bool (H, W), pixels of the query for acceptance, all by default.
+    ``judged`` bool (H, W) are the query's pixels that acceptance uses, by default all.
     """
     return _Refining(query, references, options).judge(start, refined, judged)
 
@@ -92,7 +92,7 @@ def displacement_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> Displacement | None:
-    """Return the displacement by :func:`refine_by_rendering` of a presumably correct pose.
+    """Return the displacement of a presumably correct pose by :func:`refine_by_rendering`.
 
     If the result is rejected, the displacement is that of the nearest minimum. None if overlap or
     correlation is too small, or the minimum is out of bounds.
@@ -215,7 +215,7 @@ def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
 
 
 class Rendering:
-    """Plugin ``rendering``: poses refined by warping the references into the query."""
+    """Plugin ``rendering``, which refines poses by warping the references into the query."""
 
     name = "rendering"
     Options = RenderingOptions

@@ -14,15 +14,15 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.values import Options
 
 _BLOCK_ELEMENTS = 1 << 24  # similarities in memory, per feature: 64 MiB of float32
-_VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
-_MOST_ROWS = 1 << 14  # of a block, even if its vectors are short
+_VECTOR_ELEMENTS = 1 << 25  # elements of a block of database rows, per feature: 128 MiB of float32
+_MOST_ROWS = 1 << 14  # largest number of rows in a block, even if vectors are short
 Float32 = NDArray[np.float32]
 Matrices = Sequence[NDArray[np.floating[Any]]]
 Found = tuple[NDArray[np.int64], Float32]
 
 
 class VectorBlocks(Protocol):
-    """Unit rows of a database, read in blocks; zero for images without features."""
+    """Unit-norm rows of a database, read in blocks; zero for images without features."""
 
     def __len__(self) -> int: ...
 
@@ -85,7 +85,7 @@ class FusedSearch:
         """
         if len(queries) == 0 or len(queries) != len(database):
             raise OptionError(
-                f"{len(queries)} global features of the queries, {len(database)} of the map"
+                f"the queries have {len(queries)} global features, the map has {len(database)}"
             )
         normalized_weights(self.weights, len(queries))  # check before reading
         if len(queries) == 1 or self.fusion.fuses_ranks():
@@ -186,8 +186,8 @@ def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]
 
 FusionMethod = Literal["ghm", "mean", "early", "reciprocal_rank"]
 _GAMMA = 0.5  # kapture-localization's default
-_RANK_CONSTANT = 60  # of Cormack et al.
-RANKED_IMAGES = 200  # per feature in reciprocal rank fusion
+_RANK_CONSTANT = 60  # the value of Cormack et al.
+RANKED_IMAGES = 200  # length of the ranking per feature in reciprocal rank fusion
 Similarities = NDArray[np.floating[Any]]
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 
@@ -210,7 +210,7 @@ def fuse(
     options: FusionOptions,
     weights: Sequence[float] | None = None,
 ) -> Similarities:
-    """Fuse the similarities (Q, M) of several features; weights are equal by default."""
+    """Fuse the similarities (Q, M) of several features, with equal weights by default."""
     shares = normalized_weights(weights, len(similarities)).tolist()
     total = np.zeros_like(similarities[0])
     if options.method in ("mean", "early"):

@@ -103,7 +103,7 @@ def test_no_residuals_give_the_zero_vector() -> None:
         vector = aggregate(np.zeros((0, 8), np.float32), vocabulary, options)
         assert vector.shape == (24,) and vector.dtype == np.float32 and not vector.any()
     assert not aggregate(centres, vocabulary, VladOptions()).any()
-    with pytest.raises(DataError, match="descriptors have 4 dimensions, the vocabulary 8"):
+    with pytest.raises(DataError, match="4 dimensions, but the vocabulary has 8"):
         aggregate(np.zeros((5, 4), np.float32), vocabulary)
 
 
@@ -303,7 +303,7 @@ def test_vectors_are_of_unit_length_and_nothing_stays_nothing() -> None:
     flat = (rng.normal(size=(30, 3)) @ rng.normal(size=(3, 20))).astype(np.float32)
     assert len(learn_whitening(flat, 20).projection) == 3
     for count in (1, 4):
-        with pytest.raises(DataError, match=f"from {count} images that do not differ"):
+        with pytest.raises(DataError, match=f"from {count} images with equal descriptors"):
             learn_whitening(np.ones((count, 8), np.float32), 3)
 
 

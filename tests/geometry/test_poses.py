@@ -203,7 +203,7 @@ def test_noise_and_two_positions_far_off() -> None:
     [
         (walk(8), 2, "2 photographs of the map have a GPS position"),
         (walk(8) * (1, 0.01, 0.01), 8, r"spread over 0\.\d m across"),
-        (walk(8) * 0.02, 8, "tell no scale"),
+        (walk(8) * 0.02, 8, "do not determine the scale"),
         (np.ones((4, 3)), 4, "at one place"),
     ],
 )
@@ -238,5 +238,5 @@ def test_an_alignment_ignores_wrong_poses(on_a_line: bool) -> None:
 
 def test_an_alignment_takes_three_poses() -> None:
     two = random_poses(0, 2)
-    with pytest.raises(DataError, match="takes 3 or more"):
+    with pytest.raises(DataError, match="needs 3 or more"):
         align_poses(two, two)

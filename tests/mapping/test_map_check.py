@@ -100,16 +100,22 @@ MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
     "focal length": (with_params(1000.0, 1020.0, 330.0, 235.0), "focal length 0.5 times as long"),
     "points not finite": (with_points(lambda p: one_with_nan(p)), "1 of 300 points are not finite"),
     "keypoints not finite": (with_pixels(one_with_nan), "keypoints of 00.jpg are not finite"),
-    "one pose": (with_pose(lambda p: pose_at(3)), "all of 9 images have one pose"),
-    "principal point": (with_params(500.0, 510.0, 1e6, 235.0), "cannot be: the principal point"),
-    "no focal length": (with_params(1.0, 1.0, 330.0, 235.0), "cannot be: the focal length is 1"),
+    "one pose": (with_pose(lambda p: pose_at(3)), "all 9 images have the same pose"),
+    "principal point": (
+        with_params(500.0, 510.0, 1e6, 235.0),
+        "is impossible: the principal point",
+    ),
+    "no focal length": (
+        with_params(1.0, 1.0, 330.0, 235.0),
+        "is impossible: the focal length is 1",
+    ),
     "distortion": (
         with_params(500.0, 330.0, 235.0, 50.0, model="SIMPLE_RADIAL"),
-        "cannot be: its distortion",
+        "is impossible: its distortion",
     ),
     "random points": (
         with_points(lambda p: np.random.default_rng(1).uniform(-2, 2, p.shape)),
-        "do not fit the keypoints: of 9 images 9 have",
+        "do not fit the keypoints: 9 of 9 images have",
     ),
 }
 

@@ -112,5 +112,5 @@ def test_mismatched_weights_are_named(weights: str, shared_data: Path) -> None:
     with pytest.raises(DataError, match=r"aliked-t16\.pth: .*it has no layers"):
         matcher(other).match(image, image)
     wide = replace(image, descriptors=np.zeros((3, 128), np.float32))
-    with pytest.raises(DataError, match="descriptors of 64 values, the features' have 128"):
+    with pytest.raises(DataError, match="descriptors of 64 dimensions, but the features have 128"):
         matcher(weights).match(image, wide)

@@ -111,7 +111,7 @@ random_state = runpy.run_path(str(PUBLISHED / "make_reference.py"))["random_stat
 def test_the_backbone_and_the_classes_are_the_files() -> None:
     for backbone in ("resnet101", "mobilenet"):
         assert backbone_of(published_shapes(f"deeplabv3plus-{backbone}"), "w.pth") == backbone
-    with pytest.raises(DataError, match=r"w\.pth: no DeepLabV3\+"):
+    with pytest.raises(DataError, match=r"w\.pth: not DeepLabV3\+"):
         backbone_of(["conv1a.weight"], "w.pth")
     other_classes = DeepLabV3Plus("mobilenet", num_classes=21)
     state = random_state(published_shapes("deeplabv3plus-mobilenet"))

@@ -241,7 +241,7 @@ def test_without_depth(furnished: Any) -> None:
     nothing_seen = refine(replace(furnished, depths=views | {"query.png": empty}), start)
     assert "query's depth" in nothing_seen.reason
     nothing_there = Icp().refine("query.png", COLOUR, start, [], furnished)
-    assert "the map has 0 points" in nothing_there.reason
+    assert "the map has only 0 points" in nothing_there.reason
 
 
 def test_masked_pixels_are_left_out(furnished: Any) -> None:

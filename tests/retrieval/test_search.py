@@ -148,7 +148,7 @@ ONE, MORE, WIDE = np.zeros((2, 4)), np.zeros((3, 4)), np.zeros((3, 5))
     [
         ([ONE, ONE], [ONE, MORE], None, r"number of rows: \[2, 3\]"),
         ([ONE], [WIDE], None, "different dimensions"),
-        ([ONE, ONE], [ONE], None, "2 global features of the queries, 1 of the map"),
+        ([ONE, ONE], [ONE], None, "the queries have 2 global features, the map has 1"),
         ([ONE, ONE], [ONE, ONE], [1.0, 0.0], "weights"),
     ],
 )
