@@ -144,7 +144,7 @@ def collect(
     with TemporaryDirectory() as folder:
         place = Path(folder) / "map"
         built = megloc.build_map(scene / "mapping", preset, set=assigned(changes), workspace=place)
-        every = {"min_confidence": 0.0}
+        every = {"min_confidence": 0.0, "sure_confidence": None}
         localization = built.options.localization.model_copy(update=every)
         options = built.options.model_copy(update={"localization": localization})
         localizer = Localizer(built.kapture_map, options=options)

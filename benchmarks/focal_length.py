@@ -67,7 +67,11 @@ def localized(
         seed: Localizer(
             opened,
             options=options_of_preset(
-                assignments={"localization.min_confidence": 0.0, "localization.pose.seed": seed}
+                assignments={
+                    "localization.min_confidence": 0.0,
+                    "localization.sure_confidence": None,
+                    "localization.pose.seed": seed,
+                }
             ),
         )
         for seed in seeds
