@@ -112,8 +112,8 @@ class Import(Common):
         ):
             work = Work(executor, console.track, force=self.force)
             counts = import_colmap(source, out, unit=self.unit, work=work)
-        for what, found in (("images", source.images), ("database", source.database)):
-            console.say(f"{what}: {found or 'none'}")
+        for what, path in (("images", source.images), ("database", source.database)):
+            console.say(f"{what}: {path or 'none'}")
         console.counts(counts)
         if self.unit == NO_METRES:
             console.say("unit: units of the map, of unknown scale; --unit m if in metres")

@@ -75,8 +75,8 @@ def _help_texts() -> dict[str, str]:
 def command_class(name: str) -> type[Any]:
     if name in COMMANDS:
         module, _, kind = COMMANDS[name].partition(":")
-        found: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
-        return found
+        command: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
+        return command
     from megloc_kapture.cli.stages import stage_command
 
     return stage_command(name.replace("-", "_"))

@@ -222,7 +222,9 @@ class ExtractGlobal(Reading, StageCommand):
     def run(self, console: Console) -> None:
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture_map(self.input), *map(self.kapture, self.query)]
-        extractors = {one.name: one.make(self.placement()) for one in choices if not one.is_vlad}
+        extractors = {
+            picked.name: picked.make(self.placement()) for picked in choices if not picked.is_vlad
+        }
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for choice in choices:
                 if choice.is_vlad:
@@ -359,7 +361,7 @@ class PairsQuery(Reading, StageCommand):
             f"{query.root}: no local features that the map has as well; give their folder "
             "with --features-dir",
         )
-        return [only_type(mapping, "descriptors", one) for one in asked]
+        return [only_type(mapping, "descriptors", name) for name in asked]
 
 
 def _changes(by: object, topk: int | None) -> dict[str, object]:
@@ -373,7 +375,7 @@ def _retrieval(
     options: PipelineOptions,
 ) -> Retrieval:
     """Return the global-feature types to compare, with the preset's weights."""
-    types = tuple(only_type(mapping, "global_features", one) for one in asked or (None,))
+    types = tuple(only_type(mapping, "global_features", name) for name in asked or (None,))
     how = options.fusion
     if fusion is not None:
         how = how.model_copy(update={"method": fusion})

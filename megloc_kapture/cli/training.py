@@ -235,10 +235,10 @@ class Render(Linked, Working):
         with single_threaded():
             field = open_field(self.field)
             light = None if self.appearance is None else field.appearance_of(self.appearance)
-            found = field.render(camera, pose, appearance=light)
-        write_image(self.output, found.image)
+            rendered = field.render(camera, pose, appearance=light)
+        write_image(self.output, rendered.image)
         if self.depth is not None:
-            stored = np.clip(np.round(found.depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
+            stored = np.clip(np.round(rendered.depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
             write_bytes(self.depth, cv2.imencode(".png", stored)[1].tobytes())
 
 

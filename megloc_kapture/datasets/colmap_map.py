@@ -98,9 +98,9 @@ def find_colmap(
 def _models(path: Path) -> list[Path]:
     around = path if path.name == SPARSE else path / SPARSE
     for places in ([path], [around], sorted(around.glob("*"))):
-        found = [place for place in places if _holds_model(place)]
-        if found:
-            return found
+        folders = [place for place in places if _holds_model(place)]
+        if folders:
+            return folders
     return []
 
 
@@ -183,8 +183,8 @@ class ColmapReconstruction:
         local_type = None
         if source.database is not None:
             with ColmapDatabase(source.database) as opened:
-                found = opened.feature_type()
-                local_type = None if found is None else found[0]
+                feature_type = opened.feature_type()
+                local_type = None if feature_type is None else feature_type[0]
         require(
             local_type is not None or source.images is not None,
             "there are no descriptors to match queries with: `megloc import colmap` takes the "

@@ -234,12 +234,12 @@ class KaptureForm:
         """Find the folders below a root; return None without a map."""
         patterns = _FOLDERS_OF_LOCATIONS if with_locations else _FOLDERS
         for parent in (Path(root) / name for name in _PARENTS):
-            found = [
-                [one for one in sorted(parent.glob(pattern)) if is_kapture(one)]
+            candidates = [
+                [path for path in sorted(parent.glob(pattern)) if is_kapture(path)]
                 for pattern in patterns
             ]
-            if found[0]:
-                return cls(parent, tuple(one for folders in found for one in folders))
+            if candidates[0]:
+                return cls(parent, tuple(path for folders in candidates for path in folders))
         return None
 
     def read(self, missing: Missing) -> list[KaptureImage]:
@@ -277,11 +277,11 @@ class KaptureForm:
 
     def rig(self) -> dict[str, RigidTransform]:
         """Return ``sensor_from_rig`` by sensor id; the first folder wins."""
-        found: dict[str, RigidTransform] = {}
+        poses: dict[str, RigidTransform] = {}
         for path in self.folders:
             for members in KaptureFolder(path).read().rigs.values():
-                found = {**members, **found}
-        return found
+                poses = {**members, **poses}
+        return poses
 
     def without_model(self) -> OptionError:
         return OptionError(

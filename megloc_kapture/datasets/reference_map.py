@@ -75,8 +75,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
 
     def keypoints(self, name: str) -> NDArray[np.float32]:
         """Return the keypoints of an image, float32 (N, 2), COLMAP pixels."""
-        found = self._array("keypoints", name, "<f4")
-        return np.empty((0, 2), np.float32) if found is None else np.ascontiguousarray(found[:, :2])
+        rows = self._array("keypoints", name, "<f4")
+        return np.empty((0, 2), np.float32) if rows is None else np.ascontiguousarray(rows[:, :2])
 
     def feature_type(self) -> tuple[str, str] | None:
         """Return the type of all features, or None without descriptors."""
@@ -87,11 +87,11 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             else:  # before version 4: SIFT, or imported features
                 rows = self._rows("SELECT DISTINCT cols FROM descriptors WHERE rows > 0")
                 kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for (size,) in rows}
-        found = [_TYPES.get(kind) or (f"colmap-{kind}", "u1") for kind in kinds]
-        if len(found) > 1:
-            names = ", ".join(sorted(name for name, _ in found))
+        types = [_TYPES.get(kind) or (f"colmap-{kind}", "u1") for kind in kinds]
+        if len(types) > 1:
+            names = ", ".join(sorted(name for name, _ in types))
             raise self._error(f"has descriptors of several types: {names}")
-        return found[0] if found else None
+        return types[0] if types else None
 
     def descriptors(self, name: str, dtype: str = "u1") -> NDArray[Any] | None:
         """Return the descriptors of an image, (N, D) of the type's dtype, or None."""

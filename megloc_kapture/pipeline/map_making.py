@@ -334,7 +334,7 @@ def import_colmap(
             made.rename(output / made.name)
     read.link_images(output)
     folder = KaptureFolder(output)
-    seen = sum(len(found) for found in folder.observations().values())
+    seen = sum(len(observed) for observed in folder.observations().values())
     return {"images": len(read.names), "points": len(folder.points3d()), "observations": seen}
 
 

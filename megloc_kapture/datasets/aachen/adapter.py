@@ -195,10 +195,10 @@ def from_kapture(
     form: KaptureForm, wanted: Wanted, missing: Missing
 ) -> tuple[AachenImages, dict[str, Path]]:
     """Return the images of kapture folders in the official order, and the file of each."""
-    found = form.read(missing)
-    images = AachenImages(_version_of(form, wanted, found))
+    kapture_images = form.read(missing)
+    images = AachenImages(_version_of(form, wanted, kapture_images))
     cameras: dict[str, int] = {}
-    for image in found:
+    for image in kapture_images:
         if not image.is_query and image.cam_from_world is not None:
             position = len(images.mapping.records_camera)
             camera_id = cameras.setdefault(image.sensor_id, len(cameras))
@@ -206,16 +206,16 @@ def from_kapture(
                 image.name, position, camera_id, image.camera, image.cam_from_world
             )
     for condition in (DAY, NIGHT):
-        queries = [i for i in found if i.is_query and condition in i.name.split("/")[:-1]]
+        queries = [i for i in kapture_images if i.is_query and condition in i.name.split("/")[:-1]]
         for position, image in enumerate(queries):
             images.add_query(image.name, condition, position, image.camera)
-    for image in found:
+    for image in kapture_images:
         require(
             not image.is_query or image.name in images.conditions,
             f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name",
             path=form.root,
         )
-    return images, {image.name: image.file for image in found}
+    return images, {image.name: image.file for image in kapture_images}
 
 
 def _version_of(form: KaptureForm, wanted: Wanted, images: Sequence[KaptureImage]) -> Version:

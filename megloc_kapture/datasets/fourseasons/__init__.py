@@ -170,8 +170,8 @@ def read_transformations(path: Path) -> Transformations:
 def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
     """Return source and target recording of a file name; the source may be omitted."""
     for pattern in _RELOCALIZATION_NAMES:
-        if found := pattern.fullmatch(name):
-            parts = found.groupdict()
+        if match := pattern.fullmatch(name):
+            parts = match.groupdict()
             return parts.get("source"), parts["target"]
     return None
 
@@ -260,13 +260,15 @@ class RelocalizationFile:
 
 
 def find_recordings(root: Path) -> dict[str, Recording]:
-    found = {
+    recordings = {
         folder.name: Recording(folder.name, folder)
         for folder in _folders(root)
         if any((folder / mark).exists() for mark in _MARKS)
     }
-    require(found, f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it", path=root)
-    return found
+    require(
+        recordings, f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it", path=root
+    )
+    return recordings
 
 
 def _folders(root: Path) -> list[Path]:
@@ -277,7 +279,7 @@ def _folders(root: Path) -> list[Path]:
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
     """Find relocalization files; without a source in their names they lie in its folder."""
     known = set(recordings)
-    found: dict[str, RelocalizationFile] = {}
+    files: dict[str, RelocalizationFile] = {}
     for folder in _RELOCALIZATION_FOLDERS:
         for path in sorted(root.glob(f"{folder}/reloc*.txt")):
             named = parse_relocalization_name(path.name)
@@ -293,10 +295,10 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
                     "of the reference recording",
                     path=path,
                 )
-            if path.name in found:
-                raise DataError(f"the same name as {found[path.name].path}", path=path)
-            found[path.name] = RelocalizationFile(path, source, target)
-    return sorted(found.values(), key=lambda file: (file.source, file.path.name))
+            if path.name in files:
+                raise DataError(f"the same name as {files[path.name].path}", path=path)
+            files[path.name] = RelocalizationFile(path, source, target)
+    return sorted(files.values(), key=lambda file: (file.source, file.path.name))
 
 
 # listed as missing if there is only a map recording

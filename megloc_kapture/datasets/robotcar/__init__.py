@@ -57,10 +57,10 @@ class ImageKey:
 
 def parse_image(text: str) -> ImageKey | None:
     """Parse an image name, with or without condition; return None for other names."""
-    found = _IMAGE.fullmatch(text.removeprefix("./"))
-    if found is None:
+    match = _IMAGE.fullmatch(text.removeprefix("./"))
+    if match is None:
         return None
-    return ImageKey(found["condition"] or "", found["camera"], found["stem"])
+    return ImageKey(match["condition"] or "", match["camera"], match["stem"])
 
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
@@ -135,16 +135,16 @@ class Layout:
 
     def individual_models(self) -> dict[str, Path]:
         return {
-            found[1]: folder
+            match[1]: folder
             for folder in sorted(self.individual_model("").parent.glob("*_aligned"))
-            if folder.is_dir() and (found := _MODEL.fullmatch(folder.name))
+            if folder.is_dir() and (match := _MODEL.fullmatch(folder.name))
         }
 
     def query_lists(self) -> dict[str, Path]:
         return {
-            found[1]: path
+            match[1]: path
             for path in sorted(self.query_list("").parent.glob("queries_location_*.txt"))
-            if (found := _QUERY_LIST.fullmatch(path.name))
+            if (match := _QUERY_LIST.fullmatch(path.name))
         }
 
     def is_merged(self, model: ModelChoice) -> bool:
@@ -334,9 +334,9 @@ def _scored_query(
         image.camera == SCORED_CAMERA,
         f"{image.path}: an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only",
     )
-    found = at_time.get((image.camera, image.timestamp))
-    if found is not None and image.condition in ("", found.condition):
-        return found
+    nearest = at_time.get((image.camera, image.timestamp))
+    if nearest is not None and image.condition in ("", nearest.condition):
+        return nearest
     if allow_missing:
         return None
     raise DataError(

@@ -293,12 +293,12 @@ def _summary(selection: Selection, reference_images: int) -> list[Count]:
         Count("reference images with a pose", len(reference.poses), _NUM_REGISTERED),
         Count("query images", len(queries.locations), _NUM_QUERIES),
     ]
-    found = Counter((image.condition, image.camera) for image in queries.locations)
-    others = sorted({condition for condition, _ in found} - set(_QUERIES_PER_CAMERA))
+    counted = Counter((image.condition, image.camera) for image in queries.locations)
+    others = sorted({condition for condition, _ in counted} - set(_QUERIES_PER_CAMERA))
     for condition in (*_QUERIES_PER_CAMERA, *others):
         published = _QUERIES_PER_CAMERA.get(condition)
         for camera in CAMERAS:
-            counts.append(Count(f"  {condition}, {camera}", found[condition, camera], published))
+            counts.append(Count(f"  {condition}, {camera}", counted[condition, camera], published))
     if selection.version == 2:
         counts.append(Count("training images with a pose", len(queries.train), _NUM_TRAIN))
         counts.append(Count("test images", len(queries.test), _NUM_TEST))

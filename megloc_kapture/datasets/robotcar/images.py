@@ -203,7 +203,7 @@ def middle_transform(transforms: Sequence[RigidTransform]) -> RigidTransform:
 
 
 def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, KaptureImage]:
-    found: dict[ImageKey, KaptureImage] = {}
+    by_key: dict[ImageKey, KaptureImage] = {}
     cameras: dict[str, Camera] = {}
     at_time: dict[tuple[str, int], ImageKey] = {}
     for image in form.read(missing):
@@ -220,15 +220,17 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
             "rectified to one for each side",
             path=image.file,
         )
-        found[key] = image
-    return found
+        by_key[key] = image
+    return by_key
 
 
 def car_of_kapture(form: KaptureForm, images: Mapping[ImageKey, KaptureImage]) -> Car:
     cameras = {key.camera: image.camera for key, image in images.items()}
     names = {image.sensor_id: key.camera for key, image in images.items()}
     sensors = {name: Sensor.from_camera(cameras[name], name=name) for name in sorted(cameras)}
-    return Car(sensors, {names[one]: pose for one, pose in form.rig().items() if one in names})
+    return Car(
+        sensors, {names[sensor]: pose for sensor, pose in form.rig().items() if sensor in names}
+    )
 
 
 def reference_of_kapture(images: Mapping[ImageKey, KaptureImage]) -> Reference:

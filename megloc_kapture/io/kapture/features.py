@@ -101,15 +101,15 @@ def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
     if (parent / f"{kind}.txt").is_file():
         message = "features of kapture 1.0 without a type: upgrade with kapture_upgrade_1_0_to_1_1"
         raise DataError(message, path=parent)
-    found = []
+    types = []
     with reading(parent):
         names = sorted(entry.name for entry in parent.iterdir() if not entry.name.startswith("."))
     for name in names:
         folder = parent / name / kind if orphan else parent / name
         if folder.is_dir() if kind == "matches" else (folder / f"{kind}.txt").is_file():
             with named(parent):
-                found.append(check_component(name))
-    return found
+                types.append(check_component(name))
+    return types
 
 
 def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
@@ -145,12 +145,12 @@ class FolderBlobs:
         self._folder, self._suffix = folder, suffix
 
     def names(self) -> list[str]:
-        found = []
+        names = []
         for folder, _, files in os.walk(self._folder):
             below = folder[len(str(self._folder)) :].lstrip("/")
             prefix = f"{below}/" if below else ""
-            found += [prefix + name for name in files if name.endswith(self._suffix)]
-        return sorted(found)
+            names += [prefix + name for name in files if name.endswith(self._suffix)]
+        return sorted(names)
 
     def __contains__(self, name: str) -> bool:
         try:
