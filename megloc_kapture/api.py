@@ -465,15 +465,18 @@ def train(
     features : extractor of the matched features, or of the frozen detector.
     set : options, ``{"steps": 20000}``.
     """
-    from megloc_kapture.training.train import TASKS, TrainingData
+    from megloc_kapture.training.train import TASKS
     from megloc_kapture.training.train import train as run_training
 
     if task not in TASKS:
         raise OptionError(f"unknown task {task!r}; {suggestion(task, TASKS)}")
     options = options_with(TASKS[task], set or {}, {"features.name": features})
-    data = TrainingData(
-        [KaptureFolder(path) for path in kaptures],
-        [Path(path) for path in photographs],
-        [KaptureFolder(path) for path in held_out],
+    return run_training(
+        options,
+        Path(output),
+        kaptures=[KaptureFolder(path) for path in kaptures],
+        photographs=[Path(path) for path in photographs],
+        held_out=[KaptureFolder(path) for path in held_out],
+        force=force,
+        threads=threads,
     )
-    return run_training(options, data, Path(output), force=force, threads=threads)

@@ -14,8 +14,9 @@ from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.training.labels import (
     IGNORED,
+    NEGATIVE_PX,
+    POSITIVE_PX,
     UNMATCHED,
-    LabelOptions,
     PosedView,
     labels_of_homography,
     labels_of_views,
@@ -37,7 +38,6 @@ def brute_force(
     px_a: NDArray[np.float64], px_b: NDArray[np.float64], a: PosedView, b: PosedView
 ) -> list[int]:
     """Labels of a's keypoints with depth, one by one; WITHOUT_DEPTH of the others."""
-    options = LabelOptions()
     a_in_b, known_a, visible_a = reproject(px_a, a, b)
     b_in_a, _, visible_b = reproject(px_b, b, a)
     distance = np.full((len(px_a), len(px_b)), np.inf)
@@ -50,10 +50,10 @@ def brute_force(
         away = np.nan_to_num(np.hypot(*(a_in_b[i] - px_b).T), nan=np.inf).min()
         if not known:
             result.append(WITHOUT_DEPTH)
-        elif mutual and distance[i, j] < options.positive_px:
+        elif mutual and distance[i, j] < POSITIVE_PX:
             result.append(j)
         else:
-            result.append(UNMATCHED if away > options.negative_px else IGNORED)
+            result.append(UNMATCHED if away > NEGATIVE_PX else IGNORED)
     return result
 
 
@@ -167,12 +167,10 @@ def test_overlap_is_of_the_view_that_shows_more() -> None:
     assert overlap(far, away) == 0.0
 
 
-def test_no_keypoints_no_labels_and_options_in_order() -> None:
+def test_no_keypoints_no_labels() -> None:
     view = corner_view(pose_at((0, 0, 0), 0, 0))
     none, some = np.zeros((0, 2)), np.array([[10.0, 10.0]])
     for px_a, px_b in ((none, some), (some, none), (none, none)):
         labels = labels_of_views(px_a, px_b, view, view)
         assert labels.partner_a.tolist() == [IGNORED] * len(px_a)
         assert len(labels.matches()) == 0
-    with pytest.raises(ValueError, match="smaller than positive_px"):
-        LabelOptions(positive_px=6.0)

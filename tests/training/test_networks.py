@@ -37,7 +37,7 @@ from megloc_kapture.training.networks import (
     relative_pose_error_deg,
     transport_loss,
 )
-from megloc_kapture.training.pairs import PairOptions, PosedPairs, TrainingPair
+from megloc_kapture.training.pairs import PosedPairs, TrainingPair
 from megloc_kapture.values import ImageFeatures, RigidTransform
 
 NOTHING = Labels(np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -255,7 +255,7 @@ def test_the_error_of_a_relative_pose_is_the_larger_angle() -> None:
 
 
 def test_true_matches_give_the_true_pose(walk: Path) -> None:
-    pair = PosedPairs(KaptureFolder(walk), PairOptions()).draw(np.random.default_rng(0))
+    pair = PosedPairs(KaptureFolder(walk), 640).draw(np.random.default_rng(0))
     assert pair.views is not None
     points = np.random.default_rng(1).uniform((-3, -2, 4), (1, 2, 6), (200, 3))
     sides = []
