@@ -25,7 +25,7 @@ from megloc_kapture.datasets.official import (
     last_part,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
+from megloc_kapture.datasets.reference_map import WITHOUT_DATABASE, check_model_files
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
@@ -295,7 +295,7 @@ class Aachen:
             return self._dataset(images, lambda _: form.root, missing, remarks, image_files=files)
         layout = Layout(root)
         images, left_out = layout.read(layout.version(self.options.version), missing)
-        remarks, reference = [], None
+        remarks, model = [], dict[str, Any]()
         if images.version == "1.0" and not layout.database_intrinsics.is_file():
             remarks.append(
                 f"Without {layout.database_intrinsics.name} the map images' principal points are "
@@ -306,17 +306,18 @@ class Aachen:
                 f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
             )
         if self.options.reference_model:
-            database = layout.feature_database if images.version == "1.0" else None
-            points = partial(layout.read_points, images.version)
-            reference = ReferenceModel(points, database)
-            remarks += reference.remarks()
+            model["reference"] = partial(layout.read_points, images.version)
+            if images.version == "1.0" and layout.feature_database.is_file():
+                model["reference_database"] = layout.feature_database
+            else:
+                remarks.append(WITHOUT_DATABASE)
         return self._dataset(
             images,
             layout.query_list,
             missing,
             remarks,
             links={"": layout.images},
-            reference=reference,
+            **model,
         )
 
     def _dataset(

@@ -18,7 +18,7 @@ from megloc_kapture.datasets.official import (
     OfficialDataset,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
+from megloc_kapture.datasets.reference_map import WITHOUT_DATABASE, check_model_files
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
@@ -143,18 +143,21 @@ class RobotCar:
         cameras = {camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))}
         find = image_finder(layout, missing)
         selection = select(version, reference, queries, cameras=cameras, find=find, **chosen)
-        model = None
+        model, remarks = dict[str, Any](), list[str]()
         if self.options.reference_model:
-            points = partial(_read_points, layout, selection)
-            model = ReferenceModel(points, layout.feature_database)
+            model["reference"] = partial(_read_points, layout, selection)
+            if layout.feature_database.is_file():
+                model["reference_database"] = layout.feature_database
+            else:
+                remarks.append(WITHOUT_DATABASE)
         return self._dataset(
             selection,
             read_car(layout, selection, missing),
             missing,
-            [] if model is None else model.remarks(),
+            remarks,
             reference_images=layout.num_reference_images(),
             links={"": layout.images},
-            reference=model,
+            **model,
         )
 
     def _read_kapture(

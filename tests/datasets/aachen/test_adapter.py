@@ -223,6 +223,6 @@ def test_reference_model(root: Path, tmp_path: Path) -> None:
         if database is not None:
             database.touch()
         dataset = read(root, reference_model=True)
-        assert dataset.reference is not None and dataset.reference.database == database
+        assert dataset.reference is not None and dataset.reference_database == database
         told = any("without descriptors" in remark for remark in dataset.remarks)
         assert told == (database is None)
