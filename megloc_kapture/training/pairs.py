@@ -132,8 +132,6 @@ class PosedPairs:
     def _read_overlaps(self, path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         row_of = {name: row for row, name in enumerate(self._names)}
         pairs = read_pairs(path)
-        if not all(pair.query in row_of and pair.map in row_of for pair in pairs):
-            raise DataError(f"lists images that are not in {self.folder}", path=path)
         rows = [(row_of[pair.query], row_of[pair.map]) for pair in pairs]
         near = np.array(rows, np.int64).reshape(-1, 2)
         return near, np.array([pair.score for pair in pairs], np.float64)

@@ -125,13 +125,9 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
     assert counts == {"scenes": 1, "images": 4, "without_depth": 1}
     check(tmp_path / "out" / "0015")
     found = dict(np.load(table))
-    for changes, message in (
-        ({"poses": found["poses"][:2]}, r"poses is float64 \(2, 4, 4\), expected \(5, 4, 4\)"),
-        ({"image_paths": np.array(["../../x.jpg"] * 5)}, "x.jpg"),
-    ):
-        np.savez(table, **{**found, **changes})
-        with pytest.raises(DataError, match=message):
-            import_megadepth(root, tmp_path / "broken")
+    np.savez(table, **{**found, "image_paths": np.array(["../../x.jpg"] * 5)})
+    with pytest.raises(DataError, match="x.jpg"):
+        import_megadepth(root, tmp_path / "broken")
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

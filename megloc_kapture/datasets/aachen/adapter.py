@@ -6,7 +6,7 @@ downloader leaves kapture folders.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from megloc_kapture.datasets.official import (
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import WITHOUT_DATABASE, check_model_files
-from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.errors import OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.io.dataset_tables import ImageGroup, World
@@ -167,18 +167,12 @@ class Layout:
             return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, k))
 
     def _add_queries(self, images: AachenImages, missing: Missing) -> int:
-        listed: dict[str, Path] = {}
         left_out = 0
         for condition in (DAY, NIGHT):
             path = self.query_list(condition)
             if not missing.require(path):
                 continue
             for position, (name, camera) in enumerate(read_camera_rows(path).items()):
-                require(
-                    listed.setdefault(name, path) == path,
-                    f"image {name!r} is also in {listed[name].name}: a query by day or at night?",
-                    path=path,
-                )
                 if images.version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
                     left_out += 1
                 elif missing.require(self.images / name):
@@ -292,7 +286,7 @@ class Aachen:
         if (form := _kapture_form(root)) is not None:
             images, files = from_kapture(form, self.options.version, missing)
             remarks = [f"Read from kapture folders, as v{images.version}."]
-            return self._dataset(images, lambda _: form.root, missing, remarks, image_files=files)
+            return self._dataset(images, missing, remarks, image_files=files)
         layout = Layout(root)
         images, left_out = layout.read(layout.version(self.options.version), missing)
         remarks, model = [], dict[str, Any]()
@@ -313,7 +307,6 @@ class Aachen:
                 remarks.append(WITHOUT_DATABASE)
         return self._dataset(
             images,
-            layout.query_list,
             missing,
             remarks,
             links={"": layout.images},
@@ -323,7 +316,6 @@ class Aachen:
     def _dataset(
         self,
         images: AachenImages,
-        lists: Callable[[str], Path],
         missing: Missing,
         remarks: list[str],
         **more: Any,
@@ -335,7 +327,7 @@ class Aachen:
             query=images.query,
             query_gt=truth,
             groups={name: ImageGroup(condition=condition) for name, condition in conditions},
-            names=_pose_file_names(images, lists),
+            names={query: last_part(query) for query in images.conditions},
             protocol=protocol_of(self.name).model_copy(
                 update={"pose_file_stem": _POSE_FILE_STEMS[images.version]}
             ),
@@ -348,19 +340,6 @@ class Aachen:
 
 def _kapture_form(root: Path) -> KaptureForm | None:
     return KaptureForm.find(root) if Layout(root).absent() else None
-
-
-def _pose_file_names(images: AachenImages, lists: Callable[[str], Path]) -> dict[str, str]:
-    names: dict[str, str] = {}
-    taken: dict[str, str] = {}
-    for query, condition in images.conditions.items():
-        name = names[query] = last_part(query)
-        other = taken.setdefault(name, query)
-        if other != query:
-            raise DataError(
-                f"{query} and {other} would both be {name} in the pose file", path=lists(condition)
-            )
-    return names
 
 
 def _summary(images: AachenImages) -> list[Count]:

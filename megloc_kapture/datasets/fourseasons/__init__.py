@@ -25,7 +25,6 @@ CAMERA_FILES = ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
 STEREO_FILE = "undistorted_calib_stereo.txt"
 
 _TIMESTAMP = re.compile(r"[1-9][0-9]{0,18}")
-_MAX_SCALE = 1e6
 # relocalization files of 2021, 2020 (in the source's folder) and 2022
 _RELOCALIZATION_NAMES = (
     re.compile(r"relocalizationFile_(?P<source>.+)_to_(?P<target>.+)\.txt"),
@@ -63,7 +62,6 @@ def read_pinhole(path: Path) -> Camera:
             model == "Pinhole" and len(params) in (4, 8) and not any(params[4:]),
             "expected 'Pinhole fx fy cx cy', without distortion, as images are undistorted",
         )
-        require(len(sizes) in (1, 3) and sizes[0] == sizes[-1], "expected one image size, twice")
         width, height = map(int, sizes[0])
         return Camera("PINHOLE", width, height, tuple(params[:4]))
 
@@ -89,7 +87,7 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     """
 
     def parse(fields: list[str]) -> GnssPose:
-        scale = _scale(fields[7]) if len(fields) > 7 else None
+        scale = float(fields[7]) if len(fields) > 7 else None
         quality = float(fields[8]) if len(fields) > 8 else None
         return GnssPose(_transform(fields[:7]), scale, quality)
 
@@ -110,27 +108,13 @@ def _by_timestamp(path: Path, parse: Callable[[list[str]], Row]) -> dict[int, Ro
     rows: dict[int, Row] = {}
     with reading_lines(path, comments=True) as lines:
         for timestamp, *fields in map(fields_of, lines):
-            rows[_timestamp(timestamp)] = parse(fields)
-    require(rows, "the file has no rows", path=path)
+            rows[int(timestamp)] = parse(fields)
     return rows
-
-
-def _timestamp(text: str) -> int:
-    require(_TIMESTAMP.fullmatch(text), f"{text!r} is not a timestamp in whole nanoseconds")
-    return int(text)
 
 
 def _transform(fields: Sequence[str]) -> RigidTransform:
     tx, ty, tz, qx, qy, qz, qw = numbers_of(fields, "tx ty tz qx qy qz qw")
     return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
-
-
-def _scale(text: str) -> float:
-    scale = float(text)
-    require(
-        1 / _MAX_SCALE < scale < _MAX_SCALE, f"scale {text} is not a factor between units of length"
-    )
-    return scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +145,7 @@ def read_transformations(path: Path) -> Transformations:
     for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
         with named(path, about=name):
             transforms.append(_transform(fields_of(texts.get(name, ""))))
-    with named(path):
-        scale = _scale(texts["GNSS scale"]) if "GNSS scale" in texts else None
+    scale = float(texts["GNSS scale"]) if "GNSS scale" in texts else None
     s_from_as, w_from_gpsw, e_from_gpsw = transforms
     return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
 
@@ -180,10 +163,9 @@ def read_relocalization(path: Path) -> list[RelativePose]:
     rows: dict[tuple[int, int], RelativePose] = {}
     with reading_lines(path, comments=True) as lines:
         for first, second, *fields in map(fields_of, lines):
-            reference, query = _timestamp(first), _timestamp(second)
+            reference, query = int(first), int(second)
             pose = _transform(fields) if fields else None
             rows.setdefault((reference, query), RelativePose(reference, query, pose))
-    require(rows, "no pair in the file", path=path)
     return list(rows.values())
 
 

@@ -331,14 +331,9 @@ class ImageRecords:
             members[name + suffix] = cam_from_car
         for timestamp in times:
             for name, _ in zip(CAMERAS, cameras, strict=False):
-                record, image = (timestamp, name + suffix), recording.image(timestamp, name)
-                if record in self.data.records_camera:
-                    raise DataError(
-                        f"{self.data.records_camera[record]} has the same time",
-                        path=recording.image_file(timestamp, name),
-                    )
                 if self.missing.require(recording.image_file(timestamp, name)):
-                    self.data.records_camera[record] = image
+                    image = recording.image(timestamp, name)
+                    self.data.records_camera[timestamp, name + suffix] = image
         return car
 
 
@@ -429,8 +424,6 @@ class LocalFrame:
         return cls(poses.earth_from_scene, (x, y, z))
 
     def cams_from_local(self, poses: KeyframePoses) -> dict[int, RigidTransform]:
-        if (poses.earth_from_scene is None) != (self.earth_from_scene is None):
-            raise ValueError("no way leads from one recording's scene to the other's")
         x, y, z = self.origin
         local_from_scene = RigidTransform((1.0, 0.0, 0.0, 0.0), (-x, -y, -z))
         if self.earth_from_scene is not None and poses.earth_from_scene is not None:
@@ -479,10 +472,7 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
             continue
         scale = transformations.gnss_scale if row.scale is None else row.scale
         if scale is None:
-            raise DataError(
-                "neither the pose nor Transformations.txt has a scale",
-                path=path,
-            )
+            raise DataError("neither the pose nor Transformations.txt has a scale", path=path)
         x, y, z = (scale * value for value in row.slam_from_cam.translation)
         metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))
         poses[timestamp] = scene_from_slam @ metric

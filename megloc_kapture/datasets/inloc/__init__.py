@@ -213,7 +213,4 @@ def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _listed(folder: Path) -> list[str]:
-    try:
-        return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        raise DataError(f"cannot be listed: {error.strerror}", path=folder) from error
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))

@@ -17,7 +17,6 @@ from megloc_kapture.datasets.robotcar import (
     Layout,
     Queries,
     Reference,
-    note_time,
     parse_image,
     read_intrinsics,
     read_test_names,
@@ -205,15 +204,12 @@ def middle_transform(transforms: Sequence[RigidTransform]) -> RigidTransform:
 def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, KaptureImage]:
     by_key: dict[ImageKey, KaptureImage] = {}
     cameras: dict[str, Camera] = {}
-    at_time: dict[tuple[str, int], ImageKey] = {}
     for image in form.read(missing):
         key = parse_image(image.name)
         if key is None or not key.condition:
             raise DataError(
                 f"image {image.name!r}; expected condition/camera/time.jpg", path=image.file
             )
-        with named(image.file):
-            note_time(key, at_time)
         require(
             cameras.setdefault(key.camera, image.camera) == image.camera,
             f"camera {key.camera} is not that of other images; all of RobotCar's images are "
@@ -265,7 +261,7 @@ def queries_of_kapture(
     unlisted = 0
     if version == 2 and test_list.is_file():
         at_time = {(key.camera, key.timestamp): key for key in keys}
-        test, unlisted = read_test_names(test_list, at_time, train, allow_missing=allow_missing)
+        test, unlisted = read_test_names(test_list, at_time, allow_missing=allow_missing)
     elif version == 2:
         test = {key: f"{key.camera}/{key.stem}.png" for key in poses if key not in train}
     return version, Queries({key: images[key].locations for key in keys}, train, test, unlisted)
