@@ -85,7 +85,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def feature_type(self) -> tuple[str, str] | None:
         """Return the type of all features, or None without descriptors."""
         with self._reading():
-            if self._has_types():
+            columns = self._rows("PRAGMA table_info(descriptors)")
+            if any(column[1] == "type" for column in columns):
                 rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
                 kinds = {int(kind) for (kind,) in rows}
             else:  # before version 4: SIFT, or imported features
@@ -115,9 +116,6 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         if not np.isfinite(array).all():
             raise self._error(f"{table} of {name!r} are not finite")
         return array
-
-    def _has_types(self) -> bool:
-        return any(row[1] == "type" for row in self._rows("PRAGMA table_info(descriptors)"))
 
     def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
         return self._connection.execute(query)

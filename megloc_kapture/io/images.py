@@ -64,7 +64,10 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
     image = _decoded_by_opencv(content)
     if image is None:
         with reading(path, "an image"):
-            image = _decoded_by_pillow(content)
+            from PIL import Image
+
+            with Image.open(BytesIO(content)) as opened:
+                image = pillow_pixels(opened)
     else:
         _check_complete(path, content)
     return with_8_bits(image)
@@ -80,13 +83,6 @@ def _decoded_by_opencv(content: bytes) -> NDArray[Any] | None:
     except cv2.error:
         return None
     return None if image is None else np.asarray(image)[:, :, ::-1]
-
-
-def _decoded_by_pillow(content: bytes) -> NDArray[Any]:
-    from PIL import Image
-
-    with Image.open(BytesIO(content)) as image:
-        return pillow_pixels(image)
 
 
 def pillow_pixels(image: Image.Image) -> NDArray[np.uint8]:

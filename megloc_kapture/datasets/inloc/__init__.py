@@ -162,7 +162,8 @@ class Layout:
     def _scan(self, floor: str, number: str, missing: Missing) -> Scan:
         folder = self.cutouts / floor / number
         names = _listed(folder)
-        cutouts = [_cutout(folder, name) for name in names if name.endswith(".jpg")]
+        with named(folder):
+            cutouts = [parse_cutout_name(name) for name in names if name.endswith(".jpg")]
         building = cutouts[0].building if cutouts else _building(floor)
         images = {cutout.image for cutout in cutouts}
         points = {n.removesuffix(POINTS_SUFFIX) for n in names if n.endswith(POINTS_SUFFIX)}
@@ -197,11 +198,6 @@ class Scan:
     @property
     def location(self) -> str:
         return f"{self.floor}/{self.number}"
-
-
-def _cutout(folder: Path, name: str) -> Cutout:
-    with named(folder / name):
-        return parse_cutout_name(name)
 
 
 def _building(floor: str) -> str:
