@@ -29,7 +29,6 @@ from megloc_kapture.cli.common import (
     Reading,
     Texts,
     Working,
-    assigned_pairs,
     existing,
 )
 from megloc_kapture.errors import OptionError, check_option, require
@@ -478,10 +477,13 @@ class Preprocess(Linked, Computing, Working):
             raise OptionError(f"option {option_fault(error, PreprocessingOptions)}") from error
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
-        takes = "CAMERA=VALUE"
-        for camera, value in assigned_pairs("--bottom-share", self.bottom_share, takes):
-            yield {"camera": camera, "bottom_share": value}
-        for camera, value in assigned_pairs("--polygon", self.polygon, takes):
-            yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
-        for camera, value in assigned_pairs("--mask-file", self.mask_file, takes):
-            yield {"camera": camera, "file": value}
+        for flag, key, texts in (
+            ("--bottom-share", "bottom_share", self.bottom_share),
+            ("--polygon", "polygon", self.polygon),
+            ("--mask-file", "file", self.mask_file),
+        ):
+            for text in texts:
+                camera, _, value = text.rpartition("=")
+                check_option(camera and value, f"{flag} takes CAMERA=VALUE, got {text!r}")
+                corners = [corner.split(",") for corner in value.split()]
+                yield {"camera": camera, key: corners if key == "polygon" else value}

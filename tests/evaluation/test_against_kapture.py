@@ -121,7 +121,7 @@ def test_equal_on_random_poses(
     assert_equal_figures(estimated, truth, BINS, figures_of_kapture)
 
 
-def test_equal_where_thresholds_are_met_exactly(figures_of_kapture: Figures) -> None:
+def test_equal_at_exact_thresholds(figures_of_kapture: Figures) -> None:
     truth, estimated = {}, {}
     for i, (position_m, angle_deg) in enumerate(BINS):
         half = np.deg2rad(angle_deg) / 2
@@ -136,7 +136,7 @@ def test_equal_where_thresholds_are_met_exactly(figures_of_kapture: Figures) -> 
 
 
 @pytest.mark.parametrize("share", [1 - 1e-9, 1 + 1e-9])
-def test_equal_just_below_and_just_above_every_measured_error(
+def test_equal_near_every_measured_error(
     share: float, random_poses: Callable[..., Any], figures_of_kapture: Figures
 ) -> None:
     # each query's own errors as kapture computes them are a threshold, but for the last bits, which

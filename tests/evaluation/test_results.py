@@ -61,11 +61,11 @@ def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
         (["a/b/c", "a/d/e/c"], ["b", "d/e"]),
     ],
 )
-def test_labels_tell_results_apart(paths: list[str], labels: list[str]) -> None:
+def test_labels_of_results_are_distinct(paths: list[str], labels: list[str]) -> None:
     assert distinct_labels([Path(path) for path in paths]) == labels
 
 
-def test_conditions_from_folders_where_no_table_has_them() -> None:
+def test_conditions_from_folder_names() -> None:
     rules = Benchmark(protocol=protocol_of("robotcar"))
     images = ["night-rain/rear/1.jpg", "dawn/left/2.jpg", "left/3.jpg", "dawn/night/4.jpg"]
     assert rules.conditions(images) == {
@@ -82,7 +82,7 @@ def test_conditions_from_folders_where_no_table_has_them() -> None:
     }
 
 
-def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
+def test_results_in_other_local_frames(
     world: Any, tmp_path: Path, kaptures: Callable[..., Path]
 ) -> None:
     truth_world = World(official_from_local=SimilarityTransform(translation=(100.0, 20.0, 3.0)))
@@ -98,13 +98,13 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     official = {n: truth_world.pose_in_official(p) for n, p in world.estimated.items()}
     moved = {n: other_world.pose_in_local(p) for n, p in official.items()}
     truth = kaptures(tmp_path / "one/query_gt", names, world.truth)
-    here = kaptures(tmp_path / "one/localized", names, world.estimated)
-    there = kaptures(tmp_path / "two/localized", names, moved)
+    folder = kaptures(tmp_path / "one/localized", names, world.estimated)
+    moved_folder = kaptures(tmp_path / "two/localized", names, moved)
     write_pose_file(tmp_path / "poses.txt", official)
     actual = evaluate_results(
-        [here, there, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
+        [folder, moved_folder, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
     )
-    first, *others = (one.errors.position_m for one in actual)
+    first, *others = (evaluation.errors.position_m for evaluation in actual)
     for other in others:
         np.testing.assert_allclose(other, first, rtol=0, atol=1e-9)
     # the guard: in its own frame it is metres off
@@ -112,7 +112,7 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     assert np.median(wrong[0].errors.position_m) > 1.0
 
 
-def test_truth_in_the_official_frame_is_brought_to_the_maps(
+def test_truth_in_the_official_frame(
     world: Any, tmp_path: Path, kaptures: Callable[..., Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     """As a dataset's owner has it, outside of any import."""
@@ -235,13 +235,13 @@ def test_colmap_models_are_truth_and_result(
         assert row.median_position_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_names_that_do_not_fit_are_an_error(world: Any, truth: Path, tmp_path: Path) -> None:
+def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) -> None:
     write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
     with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
 
 
-def test_alignment_is_reported_and_done() -> None:
+def test_alignment() -> None:
     rng = np.random.default_rng(0)
     turns = Rotation.random(10, random_state=0).as_matrix()
     true = {

@@ -109,7 +109,7 @@ def test_agreement_of_two_results(result: WithoutTruth, first: Result) -> None:
     assert [at.num_within for at in row.within] == [3, 3] and row.median_m == 0.0
 
 
-def test_one_pose_file_alone_and_no_pose_at_all(
+def test_a_single_result_and_one_without_poses(
     second: Result, page_of: Callable[[str], Any]
 ) -> None:
     result = evaluate_without_truth([second])
@@ -122,7 +122,7 @@ def test_one_pose_file_alone_and_no_pose_at_all(
     assert "From above" not in page_of(render_report(result)).text
 
 
-def test_nothing_to_say_is_refused(first: Result) -> None:
+def test_empty_or_equal_labels_are_refused(first: Result) -> None:
     with pytest.raises(DataError, match="no query"):
         evaluate_without_truth([Result("x", {}, ())])
     for results in ([first, first], []):

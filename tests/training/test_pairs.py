@@ -39,7 +39,7 @@ def test_pairs_are_drawn_from_overlap_bins(walk: Path, monkeypatch: pytest.Monke
     assert baselines[0.3] > baselines[0.5] + 0.4
 
 
-def test_overlaps_are_measured_once(walk: Path, tmp_path: Path) -> None:
+def test_measured_overlaps_are_read_again(walk: Path, tmp_path: Path) -> None:
     path = tmp_path / "overlaps" / "0.txt"
     source = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
     pairs = read_pairs(path)
@@ -50,7 +50,7 @@ def test_overlaps_are_measured_once(walk: Path, tmp_path: Path) -> None:
     assert again.counts()["pairs"] == 1 < source.counts()["pairs"]
 
 
-def test_a_pair_is_its_images_reduced_and_its_geometry(walk: Path) -> None:
+def test_pairs_have_reduced_images_and_geometry(walk: Path) -> None:
     source = PosedPairs(KaptureFolder(walk), SMALL)
     pair, again = (source.draw(np.random.default_rng(3)) for _ in range(2))
     assert pair.keys == again.keys and pair.keys is not None and pair.views is not None
@@ -110,8 +110,8 @@ def test_views_of_one_photograph(tmp_path: Path) -> None:
     assert len(matches) > 50
     # partners of a grid under a homography are near one, fitted to them
     a, b = (grid[rows] for rows in matches.T)
-    there = cv2.perspectiveTransform(a[None], cv2.findHomography(a, b)[0])[0]
-    assert np.linalg.norm(there - b, axis=1).mean() < 3
+    px_in_b = cv2.perspectiveTransform(a[None], cv2.findHomography(a, b)[0])[0]
+    assert np.linalg.norm(px_in_b - b, axis=1).mean() < 3
 
 
 def smooth_image() -> NDArray[np.uint8]:
@@ -133,15 +133,15 @@ def test_a_view_follows_its_homography(seed: int) -> None:
     view, view_from_image = random_view(image, (160, 120), rng)
     assert view.shape == (120, 160, 3)
     px = rng.uniform((2, 2), (158, 118), (200, 2))
-    there = cv2.perspectiveTransform(px[None], np.linalg.inv(view_from_image))[0]
+    px_in_image = cv2.perspectiveTransform(px[None], np.linalg.inv(view_from_image))[0]
     # all of it lies in the photograph
-    assert (there > -1e-3).all() and (there < (320.001, 240.001)).all()
-    inside = ((there > 1) & (there < (318, 238))).all(axis=1)
-    error = bilinear(view, px[inside]) - bilinear(image, there[inside])
+    assert (px_in_image > -1e-3).all() and (px_in_image < (320.001, 240.001)).all()
+    inside = ((px_in_image > 1) & (px_in_image < (318, 238))).all(axis=1)
+    error = bilinear(view, px[inside]) - bilinear(image, px_in_image[inside])
     assert np.abs(error).mean() < 1.0
 
 
-def test_the_same_numbers_give_the_same_view() -> None:
+def test_views_are_deterministic() -> None:
     first, second = (
         random_view(smooth_image(), (160, 120), np.random.default_rng(5)) for _ in range(2)
     )

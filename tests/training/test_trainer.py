@@ -67,7 +67,7 @@ def overfitted(chosen: TrainingOptions, walk: Path) -> list[list[float]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["matcher", "descriptor"])
-def test_eight_pairs_are_learnt_by_heart(task: str, files: dict[str, str], walk: Path) -> None:
+def test_eight_pairs_are_overfitted(task: str, files: dict[str, str], walk: Path) -> None:
     common = {"learning_rate": 1e-3, "held_out_pairs": 8}
     if task == "matcher":
         chosen = options(files, steps=300, check_every=300, pairs_per_step=4, **common)
@@ -93,7 +93,7 @@ def interrupted_after(step: int) -> Work:
 
 # of descriptors the matcher is a part
 @pytest.mark.slow
-def test_interrupted_and_resumed_is_uninterrupted(
+def test_a_resumed_training_equals_an_uninterrupted_one(
     files: dict[str, str],
     walk: Path,
     other_walk: Path,
@@ -133,7 +133,9 @@ def test_interrupted_and_resumed_is_uninterrupted(
     assert lines[0].startswith("step,learning_rate,loss,") and len(lines) == 4
 
 
-def test_seed_precision_and_start_matter(files: dict[str, str], walk: Path, tmp_path: Path) -> None:
+def test_seed_precision_and_initial_weights(
+    files: dict[str, str], walk: Path, tmp_path: Path
+) -> None:
     data = [KaptureFolder(walk)]
     first = tmp_path / "first.safetensors"
     whole = train(options(files, steps=2), first, kaptures=data)
@@ -175,7 +177,7 @@ def test_a_trained_matcher_is_read_by_the_matcher(
     assert matches.shape[1] == 2 and len(matches) == len(scores)
 
 
-def test_a_split_superpoint_is_trained_and_read(
+def test_superpoint_descriptors_are_trained_and_read(
     files: dict[str, str], walk: Path, tmp_path: Path
 ) -> None:
     """Random weights: detector frozen, gradients through SuperGlue into the descriptors."""

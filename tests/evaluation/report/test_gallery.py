@@ -86,7 +86,7 @@ def shown() -> QueryResult:
     return query
 
 
-def test_projections_of_one_point_fit_and_others_do_not(run: Run) -> None:
+def test_matches_that_fit_poses(run: Run) -> None:
     map_from_query = POSES[NEAR] @ POSES[QUERY].inverse()
     matches = run.query_px, run.map_px, CAMERA, CAMERA
     fits = fits_poses(*matches, map_from_query)

@@ -207,7 +207,7 @@ def moved(metres: float) -> RigidTransform:
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (metres, 0.0, 0.0))
 
 
-def test_the_whole_table() -> None:
+def test_text_of_a_recall_table() -> None:
     truth = dict.fromkeys(["d1", "d2", "d3", "n1", "n2"], HERE)
     estimated = {"d1": moved(0.001), "d2": moved(0.1), "d3": moved(2.0), "n1": moved(0.4)}
     conditions = {name: {"d": "day", "n": "night"}[name[0]] for name in truth}
@@ -215,7 +215,7 @@ def test_the_whole_table() -> None:
     assert text == TABLE
 
 
-def test_no_pose_at_all_strangers_and_thresholds_without_angles() -> None:
+def test_text_without_poses_and_without_angles() -> None:
     strangers = {f"x{i}.jpg": HERE for i in range(1000)}
     text = report_text(evaluate_poses(strangers, {"a.jpg": HERE}))
     for words in ("0.0 / 0.0 / 0.0 / 0.0", "no query has a pose", "the names may not agree"):
