@@ -31,7 +31,6 @@ from megloc_kapture.datasets.robotcar import (
     read_reference,
 )
 from megloc_kapture.datasets.robotcar.images import (
-    Car,
     Selection,
     car_of_kapture,
     mapping_data,
@@ -41,11 +40,14 @@ from megloc_kapture.datasets.robotcar.images import (
     read_kapture_images,
     reference_of_kapture,
     select,
+    with_images,
+    with_rig_of_model,
 )
 from megloc_kapture.errors import check_option
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
+from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Options
 
 # published counts, or counts of the published lists
@@ -193,15 +195,15 @@ class RobotCar:
     def _dataset(
         self,
         selection: Selection,
-        car: Car,
+        car: KaptureData,
         missing: Missing,
         remarks: list[str],
         *,
         reference_images: int,
         **more: Any,
     ) -> OfficialDataset:
-        car = car.with_rig_of(selection.reference)
-        mapping, query = mapping_data(selection, car), car.data(selection.query_images)
+        car = with_rig_of_model(car, selection.reference)
+        mapping, query = mapping_data(selection, car), with_images(car, selection.query_images)
         published, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
         groups = _image_groups(selection)
         others = "test images" if selection.version == 2 else "other queries"
