@@ -11,7 +11,7 @@ import kapture.io.csv
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scored import evaluate_poses
+from scored import displaced, evaluate_poses
 from tools.kapture_export_LTVL2020 import export_ltvl
 
 from megloc_kapture.evaluation.evaluate import evaluate
@@ -48,14 +48,14 @@ def random_pose(rng: np.random.Generator) -> RigidTransform:
 
 
 @pytest.fixture
-def random_poses(displace: Callable[..., RigidTransform]) -> Callable[..., tuple[Poses, Poses]]:
+def random_poses() -> Callable[..., tuple[Poses, Poses]]:
     """Function: estimated and true poses, with errors of about so many metres and degrees."""
 
     def make(count: int, metres: float, degrees: float, *, missing: int = 0) -> tuple[Poses, Poses]:
         rng = np.random.default_rng(count + missing)
         truth = {f"q/{i:03d}.jpg": random_pose(rng) for i in range(count)}
         estimated = {
-            name: displace(
+            name: displaced(
                 pose,
                 rng.normal(size=3) * metres * 10 ** rng.normal(0, 0.5),
                 rng.uniform(0, degrees),

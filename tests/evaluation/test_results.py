@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
+from scored import write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
@@ -38,13 +38,13 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 
 
 @pytest.fixture
-def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
+def truth(world: Any, tmp_path: Path) -> Path:
+    return write_kapture(tmp_path / "query_gt", list(world.truth), world.truth)
 
 
 @pytest.fixture
-def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
+def result(world: Any, tmp_path: Path) -> Path:
+    folder = write_kapture(tmp_path / "localized", list(world.truth), world.estimated)
     write_status(folder / "status.csv", world.statuses.values())
     return folder
 
@@ -82,9 +82,7 @@ def test_conditions_from_folder_names() -> None:
     }
 
 
-def test_results_in_other_local_frames(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path]
-) -> None:
+def test_results_in_other_local_frames(world: Any, tmp_path: Path) -> None:
     truth_world = World(official_from_local=SimilarityTransform(translation=(100.0, 20.0, 3.0)))
     other_world = World(
         official_from_local=SimilarityTransform(
@@ -97,9 +95,9 @@ def test_results_in_other_local_frames(
     names = list(world.truth)
     official = {n: truth_world.pose_in_official(p) for n, p in world.estimated.items()}
     moved = {n: other_world.pose_in_local(p) for n, p in official.items()}
-    truth = kaptures(tmp_path / "one/query_gt", names, world.truth)
-    folder = kaptures(tmp_path / "one/localized", names, world.estimated)
-    moved_folder = kaptures(tmp_path / "two/localized", names, moved)
+    truth = write_kapture(tmp_path / "one/query_gt", names, world.truth)
+    folder = write_kapture(tmp_path / "one/localized", names, world.estimated)
+    moved_folder = write_kapture(tmp_path / "two/localized", names, moved)
     write_pose_file(tmp_path / "poses.txt", official)
     actual = evaluate_results(
         [folder, moved_folder, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
@@ -108,12 +106,12 @@ def test_results_in_other_local_frames(
     for other in others:
         np.testing.assert_allclose(other, first, rtol=0, atol=1e-9)
     # the guard: in its own frame it is metres off
-    wrong = evaluate_results([kaptures(tmp_path / "lone", names, moved)], truth, Benchmark())
+    wrong = evaluate_results([write_kapture(tmp_path / "lone", names, moved)], truth, Benchmark())
     assert np.median(wrong[0].errors.position_m) > 1.0
 
 
 def test_truth_in_the_official_frame(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path], caplog: pytest.LogCaptureFixture
+    world: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """As a dataset's owner has it, outside of any import."""
     similarity = SimilarityTransform(
@@ -123,12 +121,12 @@ def test_truth_in_the_official_frame(
     run, names = tmp_path / "run", list(world.truth)
     write_world(run / "megloc", official_world)
     write_protocol(run / "megloc", Protocol())
-    local = kaptures(run / "query_gt", names, world.truth)
+    local = write_kapture(run / "query_gt", names, world.truth)
     official = {name: official_world.pose_in_official(pose) for name, pose in world.truth.items()}
-    actual = kaptures(run / "localized", names, world.estimated)
+    actual = write_kapture(run / "localized", names, world.estimated)
     expected = evaluate(actual, local).errors.position_m
     assert not caplog.records
-    errors = evaluate(actual, kaptures(tmp_path / "owner", names, official)).errors.position_m
+    errors = evaluate(actual, write_kapture(tmp_path / "owner", names, official)).errors.position_m
     np.testing.assert_allclose(errors, expected, rtol=0, atol=1e-6)
     assert "owner is in the dataset's official frame" in caplog.text
 
@@ -151,12 +149,12 @@ def test_the_challenges_names_are_read_back(
     assert from_file.without_truth == ()
 
 
-def test_context_of_a_result(tmp_path: Path, kaptures: Callable[..., Path]) -> None:
+def test_context_of_a_result(tmp_path: Path) -> None:
     here = {"m.jpg": RigidTransform.identity()}
     workspace = tmp_path / "run"
-    kaptures(workspace / "mapping", ["m.jpg"], here)
-    kaptures(workspace / "query", ["q.jpg", "r.jpg"], {})
-    result = kaptures(workspace / "localized", ["q.jpg"], {})
+    write_kapture(workspace / "mapping", ["m.jpg"], here)
+    write_kapture(workspace / "query", ["q.jpg", "r.jpg"], {})
+    result = write_kapture(workspace / "localized", ["q.jpg"], {})
     # not a workspace yet: the result itself is all there is
     assert workspace_of(result) is None and side_tables_near(result) is None
     alone = context_of(result)

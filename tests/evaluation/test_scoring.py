@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scored import evaluate_poses
+from scored import evaluate_poses, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate_results
@@ -195,7 +194,7 @@ def test_mlad_pairs_and_conditions() -> None:
 
 
 @pytest.fixture
-def challenge(tmp_path: Path, kaptures: Callable[..., Path]) -> tuple[Path, Path]:
+def challenge(tmp_path: Path) -> tuple[Path, Path]:
     """A workspace with two relocalization files, one query of six without a pose; a result."""
     rng = np.random.default_rng(4)
     workspace, files, tables = tmp_path / "workspace", tmp_path / "submission", []
@@ -207,9 +206,9 @@ def challenge(tmp_path: Path, kaptures: Callable[..., Path]) -> tuple[Path, Path
         name: pose_at((pose.center() + rng.normal(size=3) * 0.1).tolist(), 5.0 * int(name[2:5]) + 1)
         for name, pose in list(truth.items())[:-1]
     }
-    kaptures(workspace / "mapping", list(references), references)
-    kaptures(workspace / "query_gt", names, truth)
-    kaptures(workspace / "localized", names, estimated)
+    write_kapture(workspace / "mapping", list(references), references)
+    write_kapture(workspace / "query_gt", names, truth)
+    write_kapture(workspace / "localized", names, estimated)
     write_protocol(workspace / "megloc", protocol_of("4seasons"))
     files.mkdir()
     for letter, reference in reference_of.items():

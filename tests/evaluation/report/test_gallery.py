@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scored import evaluate_poses
+from scored import evaluate_poses, write_kapture
 
 from megloc_kapture.evaluation.report.gallery import (
     AGREES,
@@ -48,14 +47,14 @@ class Run:
 
 
 @pytest.fixture
-def run(tmp_path: Path, kaptures: Callable[..., Path]) -> Run:
+def run(tmp_path: Path) -> Run:
     rng = np.random.default_rng(0)
     workspace = tmp_path / "workspace"
     write_protocol(workspace / "megloc", Protocol())
     map_poses = {name: POSES[name] for name in (NEAR, FAR)}
-    kaptures(workspace / "mapping", list(map_poses), map_poses, CAMERA)
-    kaptures(workspace / "query", [QUERY, "query/other.jpg"], {}, CAMERA)
-    kaptures(workspace / "localized", [QUERY, "query/other.jpg"], {}, CAMERA)
+    write_kapture(workspace / "mapping", list(map_poses), map_poses, CAMERA)
+    write_kapture(workspace / "query", [QUERY, "query/other.jpg"], {}, CAMERA)
+    write_kapture(workspace / "localized", [QUERY, "query/other.jpg"], {}, CAMERA)
     for folder, names in (("mapping", map_poses), ("query", [QUERY])):
         for name in names:
             pixels = rng.integers(0, 256, (480, 640, 3), dtype=np.uint8)

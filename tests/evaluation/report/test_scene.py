@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 import pytest
 from kapture.io.csv import kapture_from_dir
-from scored import evaluate_poses
+from scored import evaluate_poses, upright_camera, write_kapture
 
 from megloc_kapture.evaluation import view as scenes
 from megloc_kapture.evaluation.report.queries import (
@@ -89,7 +89,7 @@ def check_corners(camera: Camera, pose: RigidTransform, frustum: np.ndarray) -> 
 
 
 @pytest.fixture
-def make_map(tmp_path: Path, upright: Any, kaptures: Any) -> Callable[..., Path]:
+def make_map(tmp_path: Path) -> Callable[..., Path]:
     def make(
         names: Sequence[str] = ("m/0.jpg", "m/1.jpg"),
         camera: Camera = CAMERAS[0],
@@ -97,10 +97,10 @@ def make_map(tmp_path: Path, upright: Any, kaptures: Any) -> Callable[..., Path]
         offset: float = 0.0,
     ) -> Path:
         poses = {
-            name: upright(np.array([offset + 3.0 * k, k * 0.5, 1.6]), 0.3 * k)
+            name: upright_camera(np.array([offset + 3.0 * k, k * 0.5, 1.6]), 0.3 * k)
             for k, name in enumerate(names)
         }
-        root: Path = kaptures(tmp_path / "map", names, poses, camera)
+        root: Path = write_kapture(tmp_path / "map", names, poses, camera)
         write_points3d(root, np.zeros((1, 6)) if points is None else points)
         (root / "reconstruction" / "observations.txt").write_text("# kapture format: 1.1\n")
         return root
@@ -156,10 +156,10 @@ def test_large_scenes_are_subsampled(make_map: Any, monkeypatch: Any) -> None:
     assert {tuple(row) for row in scene.points.tolist()} <= known
 
 
-def test_names_are_escaped_in_the_view(world: Any, make_map: Any, upright: Any) -> None:
+def test_names_are_escaped_in_the_view(world: Any, make_map: Any) -> None:
     root = make_map()
     name = f"query/{EVIL}"
-    world.truth[name] = world.estimated[name] = upright(np.zeros(3), 0.0)
+    world.truth[name] = world.estimated[name] = upright_camera(np.zeros(3), 0.0)
     world.conditions = dict.fromkeys(world.truth, EVIL)
     world.statuses[name] = LocalizationResult(name=name, reason=EVIL)
     evaluation = evaluation_of(world)
