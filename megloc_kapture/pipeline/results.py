@@ -145,8 +145,8 @@ class Results(Mapping[str, Pose | Failure]):
             results = self.localizer.localize_units(units, executor, candidates=self._candidates)
             tracked = track(results, len(self._units), "localizing")
             if isinstance(self.queries, Photographs):
-                alone = [outcomes for (outcomes,) in tracked]
-                tracked = ([outcomes] for outcomes in self._with_shared_cameras(alone))
+                alone = [outcome for (outcome,) in tracked]
+                tracked = ([outcome] for outcome in self._with_shared_cameras(alone))
             for unit, outcomes in zip(self._units, tracked, strict=True):
                 for (name, _), result in zip(unit, outcomes, strict=True):
                     if isinstance(result, Failure) and name in self.queries.faults:

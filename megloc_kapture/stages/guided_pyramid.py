@@ -341,7 +341,7 @@ def pyramid_mapping(
             if pair in hard_pairs and mode != "off":
                 directed = matched_of[pair], matched_of[pair[::-1]]
                 variants = [
-                    (at, rows) for at, (of_pair, _) in enumerate(directed) for rows in of_pair
+                    (at, variant) for at, (of_pair, _) in enumerate(directed) for variant in of_pair
                 ]
                 for image in set(pair) - unions.keys():
                     unions[image] = KeypointUnion(keypoints.read(image))

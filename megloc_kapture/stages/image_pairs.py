@@ -107,8 +107,8 @@ class Restrictions:
             if permitted is None:
                 yield positions, np.arange(len(images))
                 continue
-            positions_of = [position for name in permitted for position in members.get(name, ())]
-            yield positions, np.unique(np.array(positions_of, dtype=np.int64))
+            allowed = [position for name in permitted for position in members.get(name, ())]
+            yield positions, np.unique(np.array(allowed, dtype=np.int64))
 
     def _members(self, images: Sequence[str]) -> dict[str, list[int]]:
         members: dict[str, list[int]] = {}
@@ -156,7 +156,7 @@ class Retrieval:
         """
         search = FusedSearch(top_k, self.fusion, self.weights or None)
         asked = [as_blocks(source) for source in queries]
-        total, width = common_length(asked), sum(descriptor.dimension for descriptor in asked)
+        total, width = common_length(asked), sum(source.dimension for source in asked)
         step = max(1, _QUERY_ELEMENTS // max(width, 1))
         blocks = []
         for start in range(0, total, step) or (0,):
