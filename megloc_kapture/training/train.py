@@ -76,9 +76,6 @@ class TrainingOptions(NetworkOptions):
         multiple_of=2,
         description="number of attention layers, alternating self and cross",
     )
-    deep_supervision: bool = Field(
-        default=False, description="average the loss over all cross-attention layers"
-    )
     sinkhorn_iterations: int = Field(default=50, gt=0, description="in training and evaluation")
     matcher_weights: str | None = Field(
         default=None, description="initial SuperGlue; none: random weights"
@@ -122,8 +119,7 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
                 f"{head.descriptor_size} dimensions; {options.features.name} has {size}"
             )
         describer = describer_of(extractor) if isinstance(options, DescriptorOptions) else None
-        iterations, deep = options.sinkhorn_iterations, options.deep_supervision
-        return PairModel(head, describer, iterations=iterations, deep_supervision=deep)
+        return PairModel(head, describer, iterations=options.sinkhorn_iterations)
 
 
 class Trainer:

@@ -163,24 +163,6 @@ def test_products_match_as_nearest_neighbours() -> None:
     assert ((inner.argmax(0)[inner.argmax(1)] == rows) & mutual).sum() > 0.7 * mutual.sum() > 5
 
 
-def test_deep_supervision_averages_cross_attention_layers(files: dict[str, str]) -> None:
-    extractor = extractors(files)[1]
-    images = texture(96, 128), texture(96, 128, 1)
-    labels = Labels(np.arange(10), np.arange(10))
-    pair = FrozenFeatures(extractor, 10).prepare(TrainingPair(images, None, lambda a, b: labels))
-    torch.manual_seed(0)
-    head = SuperGlueNet(encoder_sizes(64), num_layers=6).eval()
-    deep = PairModel(head, None, iterations=10, deep_supervision=True).eval()
-    losses = []
-    for layers in (2, 4, 6):
-        shallow = SuperGlueNet(encoder_sizes(64), num_layers=layers).eval()
-        kept = {k: v for k, v in head.state_dict().items() if k in shallow.state_dict()}
-        shallow.load_state_dict(kept)
-        losses.append(PairModel(shallow, None, iterations=10).eval()([pair]))
-    torch.testing.assert_close(deep([pair]), torch.stack(losses).mean())
-    assert deep.match(pair)[1] == pytest.approx(losses[-1].item(), rel=1e-5)
-
-
 def test_a_pair_without_keypoints_has_no_loss(files: dict[str, str]) -> None:
     blank = np.zeros((64, 64, 3), np.uint8)
     options = SuperPointOptions(weights=files["superpoint"], device="cpu", threshold=0.9)

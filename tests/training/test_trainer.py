@@ -100,7 +100,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     photographs: Path,
     tmp_path: Path,
 ) -> None:
-    chosen = options(files, DescriptorOptions, deep_supervision=True, held_out_pairs=3)
+    chosen = options(files, DescriptorOptions, held_out_pairs=3)
     data = {
         "kaptures": [KaptureFolder(walk)],
         "photographs": [photographs],
