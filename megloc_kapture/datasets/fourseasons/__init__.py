@@ -66,21 +66,13 @@ def read_pinhole(path: Path) -> Camera:
         return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
-@dataclass(frozen=True, slots=True)
-class GnssPose:
-    """A row of ``GNSSPoses.txt``; None if a field is missing.
-
-    ``slam_from_cam`` is the undistorted left camera's pose in SLAM units, ``scale`` metres per
-    unit, ``fusion_quality`` 2 for fused with GNSS, 1 for interpolated, 0 for none.
-    """
-
-    slam_from_cam: RigidTransform
-    scale: float | None
-    fusion_quality: float | None
+# pose of the undistorted left camera in SLAM units, metres per unit, and the fusion quality (2
+# fused with GNSS, 1 interpolated, 0 none); None if a field is missing
+GnssPose = tuple[RigidTransform, float | None, float | None]
 
 
 def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
-    """Read ``GNSSPoses.txt`` by timestamp (ns).
+    """Read ``slam_from_cam``, scale and fusion quality of ``GNSSPoses.txt`` by timestamp (ns).
 
     A row is ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; published rows have
     10 fields, their header announces 11.
@@ -89,7 +81,7 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     def parse(fields: list[str]) -> GnssPose:
         scale = float(fields[7]) if len(fields) > 7 else None
         quality = float(fields[8]) if len(fields) > 8 else None
-        return GnssPose(_transform(fields[:7]), scale, quality)
+        return _transform(fields[:7]), scale, quality
 
     return _by_timestamp(path, parse)
 
@@ -117,22 +109,12 @@ def _transform(fields: Sequence[str]) -> RigidTransform:
     return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
 
 
-@dataclass(frozen=True, slots=True)
-class Transformations:
-    """The transforms from a recording's SLAM world to the earth (ECEF), e.
+def read_transformations(path: Path) -> tuple[RigidTransform, RigidTransform, float | None]:
+    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers.
 
-    The level visual world is w, the scene's east-north-up frame is gpsw. ``gnss_scale`` is metres
-    per SLAM unit, or None.
+    Return ``scene_from_slam`` without scale (the scene's axes are east, north and up),
+    ``earth_from_scene`` (ECEF), and metres per SLAM unit or None.
     """
-
-    s_from_as: RigidTransform
-    w_from_gpsw: RigidTransform
-    e_from_gpsw: RigidTransform
-    gnss_scale: float | None
-
-
-def read_transformations(path: Path) -> Transformations:
-    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers."""
     texts: dict[str, str] = {}
     name = ""
     with reading_lines(path) as lines:
@@ -146,8 +128,8 @@ def read_transformations(path: Path) -> Transformations:
         with named(path, about=name):
             transforms.append(_transform(fields_of(texts.get(name, ""))))
     scale = float(texts["GNSS scale"]) if "GNSS scale" in texts else None
-    s_from_as, w_from_gpsw, e_from_gpsw = transforms
-    return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
+    world_from_slam, world_from_scene, earth_from_scene = transforms
+    return world_from_scene.inverse() @ world_from_slam, earth_from_scene, scale
 
 
 def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
