@@ -178,7 +178,7 @@ def write_reference_map(
     ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
     keypoint_ids = np.full(len(order), -1, np.int32)  # -1: omitted observation
     new_ids = np.zeros(len(image_names), np.int32)
-    lengths, sources = dict[str, int](), dict[str, str]()
+    lengths, sources = dict[str, int](), dict[str, str]()  # keypoints, and names in the database
     with ExitStack() as stack:
         source = None
         if database is not None:
@@ -189,20 +189,16 @@ def write_reference_map(
                 f"has features of type {feature_type[0]}, not {keypoints_type}",
                 path=database,
             )
+            stored = {
+                name: source.name_of((database_names or {}).get(name, name)) for name in names
+            }
+            sources = {image: name for image, name in stored.items() if name is not None}
         for new_id, name in enumerate(names):
             position = positions[name]
             new_ids[position] = new_id
             rows = order[ends[position] : ends[position + 1]]
             features, xy_px = points.feature_ids[rows].astype(np.int64), points.xy_px[rows]
-            if source is None:
-                _, first, numbers = np.unique(features, return_index=True, return_inverse=True)
-                keypoints = xy_px[first]
-            elif (stored := source.name_of((database_names or {}).get(name, name))) is not None:
-                keypoints, numbers = _keypoints_of(source, stored, features, xy_px), features
-                sources[name] = stored
-            else:
-                require(not len(features), f"has no image {name!r}", path=database)
-                keypoints, numbers = np.empty((0, 2), np.float32), features
+            keypoints, numbers = _keypoints_of(source, name, sources.get(name), features, xy_px)
             if scales and name in scales:
                 keypoints = keypoints * np.array(scales[name], np.float32)
             lengths[name] = len(keypoints)
@@ -232,16 +228,31 @@ def write_reference_map(
 
 
 def _keypoints_of(
-    database: ColmapDatabase, name: str, features: NDArray[np.int64], xy_px: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return the keypoints of an image of the database; they must agree with the model's."""
-    keypoints = database.keypoints(name)
+    database: ColmapDatabase | None,
+    name: str,
+    stored: str | None,
+    features: NDArray[np.int64],
+    xy_px: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the keypoints of an image, and the row of each of the model's features in them.
+
+    ``stored`` is the image's name in the database, whose keypoints must agree with the model's.
+    """
+    if database is None:
+        _, first, rows = np.unique(features, return_index=True, return_inverse=True)
+        return xy_px[first], rows
+    if stored is None:
+        require(not len(features), f"has no image {name!r}", path=database.path)
+        return np.empty((0, 2), np.float32), features
+    keypoints = database.keypoints(stored)
     fits = features.max(initial=-1) < len(keypoints)
     if fits:
         shifts = np.abs(keypoints[features] - xy_px)
         fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
-    require(fits, f"is not of this model: its features of {name!r} are others", path=database.path)
-    return keypoints
+    require(
+        fits, f"is not of this model: its features of {stored!r} are others", path=database.path
+    )
+    return keypoints, features
 
 
 def _write_descriptors(
