@@ -19,7 +19,6 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import read_colmap_model
@@ -28,19 +27,13 @@ from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 
 _DEPTHS = ("phoenix/S6/zl548/MegaDepth_v1/{}/dense0/depths", "depth_undistorted/{}")
 _UNDISTORTED, _SCENE_INFO = "Undistorted_SfM", "scene_info"
 _MODELS = ("sparse", "sparse-txt", "sparse/0")
 _ARRAYS = ("image_paths", "intrinsics", "poses")
 _IDENTITY = RigidTransform.identity()
-
-
-class MegaDepthOptions(Options):
-    """Options of importing MegaDepth."""
-
-    scenes: tuple[str, ...] = Field(default=(), description="scene numbers; none: all")
 
 
 @dataclass(frozen=True)
@@ -52,11 +45,10 @@ class _Image:
 
 
 def import_megadepth(
-    root: Path, output: Path, options: MegaDepthOptions | None = None, *, work: Work = HERE
+    root: Path, output: Path, scenes: Sequence[str] = (), *, work: Work = HERE
 ) -> dict[str, int]:
-    """Write each scene as ``output/SCENE``; images without metric depth are omitted."""
-    options = options or MegaDepthOptions()
-    scenes = [check_component(name) for name in options.scenes] or _scenes(root)
+    """Write each scene, by default all, as ``output/SCENE``; without images of no metric depth."""
+    scenes = list(map(check_component, scenes)) or _scenes(root)
     require(scenes, f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
     counts = {"scenes": 0, "images": 0, "without_depth": 0}
     for scene in scenes:

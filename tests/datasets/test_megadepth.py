@@ -14,7 +14,6 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.datasets.megadepth import (
-    MegaDepthOptions,
     import_megadepth,
 )
 from megloc_kapture.errors import DataError
@@ -121,7 +120,7 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
     script = tmp_path / "plain_arrays.py"
     script.write_text(lines.replace("TABLE", repr(str(table))))
     subprocess.run([sys.executable, script], check=True)
-    counts = import_megadepth(root, tmp_path / "out", MegaDepthOptions(scenes=("0015",)))
+    counts = import_megadepth(root, tmp_path / "out", ("0015",))
     assert counts == {"scenes": 1, "images": 4, "without_depth": 1}
     check(tmp_path / "out" / "0015")
     found = dict(np.load(table))
@@ -134,11 +133,11 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither Undistorted_SfM/SCENE nor scene_info/SCENE.npz"):
         import_megadepth(tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match=r"neither .*0001 nor .*0001\.npz exists"):
-        import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("0001",)))
+        import_megadepth(tmp_path, tmp_path / "out", ("0001",))
     (tmp_path / "empty" / "scene_info").mkdir(parents=True)
     arrays = {"intrinsics": np.eye(3)[None], "poses": np.eye(4)[None]}
     np.savez(tmp_path / "empty" / "scene_info" / "7.npz", image_paths=["x.jpg"], **arrays)
     with pytest.raises(DataError, match="scene 7 has no image with depth"):
         import_megadepth(tmp_path / "empty", tmp_path / "out")
     with pytest.raises(DataError, match="'..'"):
-        import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("..",)))
+        import_megadepth(tmp_path, tmp_path / "out", ("..",))
