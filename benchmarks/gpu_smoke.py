@@ -43,7 +43,7 @@ from megloc_kapture.matching.networks import LightGlue, SuperGlue
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.preprocessing.deeplab import DeepLab
 from megloc_kapture.stages.work import Work, in_batches
-from megloc_kapture.training.train import TrainingData, TrainingOptions, train
+from megloc_kapture.training.train import TrainingOptions, train
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "rendering"))
@@ -247,10 +247,9 @@ def training(device: str, place: Path) -> None:
     options = TrainingOptions.model_validate(
         {"features": {"name": "superpoint"}, "steps": 4, "layers": 2, "pairs_per_step": 1,
          "max_keypoints": 40, "check_every": 2, "held_out_pairs": 2, "device": device,
-         "pairs": {"max_size_px": 200}}
+         "max_size_px": 200}
     )  # fmt: skip
-    folder = KaptureFolder(place / "scene" / "mapping")
-    data = TrainingData([folder], [], [])
+    folders = [KaptureFolder(place / "scene" / "mapping")]
 
     def track(items: Iterable[Any], total: int, label: str) -> Iterator[Any]:
         for number, item in enumerate(items):
@@ -259,10 +258,10 @@ def training(device: str, place: Path) -> None:
             yield item
 
     whole, parts = (place / name / "x.safetensors" for name in ("whole", "parts"))
-    train(options, data, whole)
+    train(options, whole, kaptures=folders)
     with suppress(KeyboardInterrupt):
-        train(options, data, parts, work=Work(track=track))
-    train(options, data, parts)
+        train(options, parts, kaptures=folders, work=Work(track=track))
+    train(options, parts, kaptures=folders)
     expected, resumed = load_file(whole), load_file(parts)
     for key, value in expected.items():
         apart = float((resumed[key].float() - value.float()).abs().max())

@@ -39,7 +39,7 @@ from megloc_kapture.values import ImageFeatures, RigidTransform
 
 TRAINING_SEED, HELD_OUT_SEED = 1000, 2000
 ALBUM = {"stations_per_place": 6, "day_queries": 16, "night_queries": 24}
-PAIRS = {"pairs.max_size_px": 640, "max_keypoints": 512, "check_every": 250}
+PAIRS = {"max_size_px": 640, "max_keypoints": 512, "check_every": 250}
 DESCRIPTOR = {"through": "products", "pairs_per_step": 4, "learning_rate": 2e-4, "steps": 20_000}
 MATCHER = {"layers": 12, "pairs_per_step": 8, "learning_rate": 5e-4, "steps": 100_000}
 

@@ -80,9 +80,9 @@ class Map:
         self._localizers: dict[tuple[str, ...], Localizer] = {}
 
     def __repr__(self) -> str:
-        own = self.kapture_map
-        types = ", ".join(own.stored_types())
-        return f"Map({str(own.folder.root)!r}: {len(own.images)} images, features {types})"
+        root, images = self.kapture_map.folder.root, self.kapture_map.images
+        types = ", ".join(self.kapture_map.stored_types())
+        return f"Map({str(root)!r}: {len(images)} images, features {types})"
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
         """Return the cached localizer of :meth:`localize` with these pose refiners."""
@@ -235,7 +235,7 @@ def open_map(
     options = options_of_preset(preset, assignments=set or {})
     opened = KaptureMap.open(
         kapture_of(path),
-        features_dirs=[Path(one) for one in features_dirs],
+        features_dirs=[Path(folder) for folder in features_dirs],
         pixel_origin=pixel_origin,
     )
     if fault := opened.fault():
@@ -311,7 +311,7 @@ def map_photographs(
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers are used instead.
     """
-    paths = [Path(one) for one in ([images] if isinstance(images, str | Path) else images)]
+    paths = [Path(path) for path in ([images] if isinstance(images, str | Path) else images)]
     options = options_of_photographs(preset, set or {})
     photographs = Photographs(paths, camera)
     asked = () if scale is None else (scale,) if scale == "gps" else tuple(map(str, scale))
@@ -402,9 +402,9 @@ def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any
     or MissingWeightsError if the extractor cannot be loaded.
     """
     pixels = image if isinstance(image, np.ndarray) else read_image_rgb(Path(image))
-    found = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), [(pixels, None)])[0]
+    extracted = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), [(pixels, None)])[0]
     height, width = pixels.shape[:2]
-    return ImageFeatures(found.keypoints_px, found.descriptors, width, height)
+    return ImageFeatures(extracted.keypoints_px, extracted.descriptors, width, height)
 
 
 def match(
@@ -414,9 +414,9 @@ def match(
 
     PluginError or MissingWeightsError if the matcher cannot be loaded.
     """
-    found: tuple[NDArray[np.int64], NDArray[np.float32]]
-    found = load_plugin(MATCHERS, matcher, options).match(first, second)
-    return found
+    matches: tuple[NDArray[np.int64], NDArray[np.float32]]
+    matches = load_plugin(MATCHERS, matcher, options).match(first, second)
+    return matches
 
 
 def solve_pose(
@@ -465,15 +465,18 @@ def train(
     features : extractor of the matched features, or of the frozen detector.
     set : options, ``{"steps": 20000}``.
     """
-    from megloc_kapture.training.train import TASKS, TrainingData
+    from megloc_kapture.training.train import TASKS
     from megloc_kapture.training.train import train as run_training
 
     if task not in TASKS:
         raise OptionError(f"unknown task {task!r}; {suggestion(task, TASKS)}")
     options = options_with(TASKS[task], set or {}, {"features.name": features})
-    data = TrainingData(
-        [KaptureFolder(path) for path in kaptures],
-        [Path(path) for path in photographs],
-        [KaptureFolder(path) for path in held_out],
+    return run_training(
+        options,
+        Path(output),
+        kaptures=[KaptureFolder(path) for path in kaptures],
+        photographs=[Path(path) for path in photographs],
+        held_out=[KaptureFolder(path) for path in held_out],
+        force=force,
+        threads=threads,
     )
-    return run_training(options, data, Path(output), force=force, threads=threads)

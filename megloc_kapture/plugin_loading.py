@@ -73,7 +73,7 @@ def checked_array(
     import numpy as np
 
     if not isinstance(array, np.ndarray):
-        found = type(array).__name__
+        actual = type(array).__name__
     else:
         lengths = zip(array.shape, shape, strict=False)
         fits = array.ndim == len(shape) and all(b in (None, a) for a, b in lengths)
@@ -81,9 +81,9 @@ def checked_array(
             if not np.isfinite(array).all():
                 raise PluginError(f"{who}: values that are not finite")
             return array
-        found = f"{array.dtype} {array.shape}"
+        actual = f"{array.dtype} {array.shape}"
     wanted = ", ".join("N" if length is None else str(length) for length in shape)
-    raise PluginError(f"{who}: got {found}, expected {' or '.join(dtypes)} ({wanted})")
+    raise PluginError(f"{who}: got {actual}, expected {' or '.join(dtypes)} ({wanted})")
 
 
 def option_fault(error: ValidationError, model: type[Options]) -> str:
@@ -98,26 +98,26 @@ def option_fault(error: ValidationError, model: type[Options]) -> str:
 
 def plugin_class(group: str, name: str) -> Any:
     """Return the class registered as ``name`` in ``group``; PluginError if impossible."""
-    found = [entry for entry in entry_points(group=group) if entry.name == name]
-    if not found:
+    entries = [entry for entry in entry_points(group=group) if entry.name == name]
+    if not entries:
         known = suggestion(name, plugin_names(group), listed="registered: ")
         raise PluginError(f"no plugin {name!r} in {group}; {known}")
-    origins = {entry.value for entry in found}
+    origins = {entry.value for entry in entries}
     if len(origins) > 1:
         raise PluginError(f"plugin {name!r} of {group} is registered twice: {sorted(origins)}")
     try:
-        kind = found[0].load()
+        kind = entries[0].load()
     except Exception as error:  # any error of a foreign module's import
         reason = missing_extra(error) or error
         raise PluginError(
-            f"plugin {name!r} ({found[0].value}) cannot be loaded: {reason}"
+            f"plugin {name!r} ({entries[0].value}) cannot be loaded: {reason}"
         ) from error
     protocol = PROTOCOLS[group]
     missing = [member for member in _members(protocol) if not hasattr(kind, member)]
     if not isinstance(kind, type) or missing:
         what = "is no class" if not isinstance(kind, type) else f"lacks {', '.join(missing)}"
         raise PluginError(
-            f"plugin {name!r} ({found[0].value}) does not fulfil {protocol.__name__}: it {what}"
+            f"plugin {name!r} ({entries[0].value}) does not fulfil {protocol.__name__}: it {what}"
         )
     return kind
 

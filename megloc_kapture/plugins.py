@@ -47,7 +47,7 @@ class PluginChoice(Options):
 
 def chosen_by_name(known: Iterable[PluginChoice], names: Iterable[str]) -> list[dict[str, Any]]:
     """Choose plugins by name, with their known settings."""
-    of_name = {one.name: one.model_dump() for one in known}
+    of_name = {choice.name: choice.model_dump() for choice in known}
     return [of_name.get(name, {"name": name}) for name in names]
 
 

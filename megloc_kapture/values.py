@@ -45,7 +45,7 @@ Precision = Literal["full", "half"]
 def _is_list(annotation: Any) -> bool:
     """True for ``tuple[X, ...]``, also if it may be None."""
     kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
-    return any(get_origin(one) is tuple and get_args(one)[-1] is Ellipsis for one in kinds)
+    return any(get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis for kind in kinds)
 
 
 def _may_be_none(annotation: Any) -> bool:
@@ -190,9 +190,9 @@ class RigidTransform:
 
     def matrix(self) -> NDArray[np.float64]:
         """Return the transform as float64 (4, 4)."""
-        found = np.eye(4)
-        found[:3, :3], found[:3, 3] = self.rotation_matrix(), self.translation
-        return found
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation_matrix(), self.translation
+        return matrix
 
     def inverse(self) -> RigidTransform:
         """Return ``b_from_a`` of an ``a_from_b``."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import tyro
 
-from megloc_kapture.errors import DataError, OptionError, check_option, require
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.text_lines import CameraList, read_cameras
@@ -98,14 +98,6 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
     for folder in folders:
         require(folder.is_dir(), "no such folder", path=folder)
     return tuple(folders)
-
-
-def assigned_pairs(flag: str, texts: Sequence[str], takes: str) -> Iterator[tuple[str, str]]:
-    """Yield both sides of each ``A=B``, split at the last sign."""
-    for text in texts:
-        name, _, value = text.rpartition("=")
-        check_option(name and value, f"{flag} takes {takes}, got {text!r}")
-        yield name, value
 
 
 def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:

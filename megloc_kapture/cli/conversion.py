@@ -21,7 +21,8 @@ from megloc_kapture.cli.common import (
 )
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
-from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
+from megloc_kapture.datasets.megadepth import import_megadepth
+from megloc_kapture.errors import check_option
 from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.datasets import (
@@ -35,7 +36,7 @@ from megloc_kapture.pipeline.datasets import (
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.export import ExportFormat, export
 from megloc_kapture.pipeline.map_making import import_colmap
-from megloc_kapture.pipeline.presets import assigned, options_with
+from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.stages.query_poses import set_aside_unreadable
 from megloc_kapture.stages.stage import MAP
 from megloc_kapture.stages.work import Work
@@ -112,17 +113,20 @@ class Import(Common):
         ):
             work = Work(executor, console.track, force=self.force)
             counts = import_colmap(source, out, unit=self.unit, work=work)
-        for what, found in (("images", source.images), ("database", source.database)):
-            console.say(f"{what}: {found or 'none'}")
+        for what, path in (("images", source.images), ("database", source.database)):
+            console.say(f"{what}: {path or 'none'}")
         console.counts(counts)
         if self.unit == NO_METRES:
             console.say("unit: units of the map, of unknown scale; --unit m if in metres")
 
     def _import_megadepth(self, console: Console) -> None:
-        options = options_with(MegaDepthOptions, self.set)
+        chosen = assigned(self.set)
+        scenes = chosen.pop("scenes", ())
+        check_option(not chosen, f"megadepth has one option, scenes; got {', '.join(chosen)}")
+        names = [str(name) for name in (scenes if isinstance(scenes, list | tuple) else [scenes])]
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
             work = Work(track=console.track)
-            counts = import_megadepth(self.root, out, options, work=work)
+            counts = import_megadepth(self.root, out, names, work=work)
         console.counts(counts)
 
 

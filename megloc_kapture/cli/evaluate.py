@@ -70,9 +70,9 @@ class Evaluate(Common):
             [self.gt, *self.input], side_tables=self.side_tables, dataset=self.dataset
         )
         thresholds = [Threshold.parse(text) for text in self.thresholds] or None
-        found: Reported
+        reported: Reported
         if self.gt is None:
-            found = results_without_truth(
+            reported = results_without_truth(
                 self.input, benchmark, thresholds=thresholds, mapping=self.map
             )
         else:
@@ -84,11 +84,11 @@ class Evaluate(Common):
                 mapping=self.map,
                 align=self.align,
             )
-            found = compare(evaluations) if len(evaluations) > 1 else evaluations[0]
+            reported = compare(evaluations) if len(evaluations) > 1 else evaluations[0]
         if self.output is not None:
             with staged_output(self.output, kind=EVALUATION, force=self.force) as out:
-                write_report(out, found)
-        console.result(report_text(found))
+                write_report(out, reported)
+        console.result(report_text(reported))
 
     def _check(self) -> None:
         check_option(self.input, "no result given; use -i")
@@ -149,9 +149,9 @@ class Submit(Common):
             raise OptionError(f"{place} exists and is not a {kind}")
         empty = folder and place.exists() and not any(place.iterdir())
         paths = [provenance_path(place)] if empty else [place, provenance_path(place)]
-        there = [path for path in paths if path.exists()]
-        if there and not self.force:
-            raise OptionError(f"{there[0]} exists; -f overwrites it")
+        existing = [path for path in paths if path.exists()]
+        if existing and not self.force:
+            raise OptionError(f"{existing[0]} exists; -f overwrites it")
 
 
 def summary(counts: Mapping[str, int]) -> str:
@@ -217,16 +217,16 @@ class Check(Common):
 
         # e.g. runs/synthetic-aachen-classic is not of dataset synthetic
         longer = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
-        found = [
+        workspaces = [
             path
             for path in sorted(_RUNS.glob(f"{self.dataset}-*"))
             if (path / "mapping" / "sensors" / "sensors.txt").is_file()
             and not path.name.startswith(longer or "/")
         ]
-        if len(found) == 1:
-            console.say(f"compared with {found[0]}")
-            return found[0]
-        if found:
-            names = ", ".join(map(str, found))
+        if len(workspaces) == 1:
+            console.say(f"compared with {workspaces[0]}")
+            return workspaces[0]
+        if workspaces:
+            names = ", ".join(map(str, workspaces))
             console.say(f"compared with none of {names}: choose with --data")
         return None

@@ -93,12 +93,12 @@ class Info(Reading, Common):
         for local_type, keypoints in opened.keypoints.items():
             origin = keypoints.pixel_origin
             errors = ", ".join(f"{name} {value:.3f} px" for name, value in origin.error_px.items())
-            found = keypoints.extractor()
+            extractor = keypoints.extractor()
             line(console, "localizing with", local_type)
             line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
             line(console, "", f"median reprojection error by origin: {errors}")
-            line(console, "map descriptors", describe_descriptors(opened, keypoints, found))
-            line(console, "query features", describe_extraction(local_type, found))
+            line(console, "map descriptors", describe_descriptors(opened, keypoints, extractor))
+            line(console, "query features", describe_extraction(local_type, extractor))
         describe_retrieval(console, opened)
 
 
@@ -114,10 +114,9 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
     line(console, "images", f"{images} ({cameras}), {len(data.poses())} with a pose")
     if data.records_depth:
         joined = len(depth_records(data))
-        told = f"{len(data.records_depth)}, of {joined} images"
         # depth sensors in the camera's rig
-        told += "" if joined else ": ignored, as no rig links their sensor to a camera"
-        line(console, "depth maps", told)
+        use = "" if joined else ": ignored, as no rig links their sensor to a camera"
+        line(console, "depth maps", f"{len(data.records_depth)}, of {joined} images{use}")
     for kind in ("keypoints", "descriptors", "global_features"):
         for name in folder.types(kind):
             reader = getattr(folder, kind)(name)
@@ -217,20 +216,20 @@ class OptionsCommand(Common):
         every = list(options_of(options_of_preset(self.preset)))
         if self.basic:
             every = [option for option in every if option.key in BASIC_OPTIONS]
-        found = [one for one in every if _is_below(one.key, self.key)]
-        if not found:
-            found = list(_options_of_plugins(self.key))
-        if not found:
-            steps = {one.key.rpartition(".")[0] for one in every} - {""}
-            known = sorted({*(one.key for one in every), *steps, *_plugins()})
+        selected = [option for option in every if _is_below(option.key, self.key)]
+        if not selected:
+            selected = list(_options_of_plugins(self.key))
+        if not selected:
+            steps = {option.key.rpartition(".")[0] for option in every} - {""}
+            known = sorted({*(option.key for option in every), *steps, *_plugins()})
             near = get_close_matches(self.key, known, n=3)
             hint = f"did you mean {' or '.join(near)}? " if near else ""
             raise OptionError(
                 f"no option, step or plugin {self.key!r}; {hint}`megloc options` lists all options"
             )
-        for one in found:
-            console.result(f"{one.key} = {shown(one.value)}")
-            console.result(f"    {one.kind}{f'; {one.meaning}' if one.meaning else ''}")
+        for option in selected:
+            console.result(f"{option.key} = {shown(option.value)}")
+            console.result(f"    {option.kind}{f'; {option.meaning}' if option.meaning else ''}")
 
 
 def shown(value: Any) -> str:
@@ -240,7 +239,7 @@ def shown(value: Any) -> str:
     if isinstance(value, Options):
         return json.dumps(value.model_dump(mode="json", exclude_defaults=True))
     if isinstance(value, tuple | list):
-        return f"[{', '.join(shown(one) for one in value)}]"
+        return f"[{', '.join(shown(item) for item in value)}]"
     if value is None or isinstance(value, bool):
         return str(value).lower()
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -252,14 +251,14 @@ def _is_below(key: str, asked: str) -> bool:
 
 def _plugins() -> dict[str, list[str]]:
     """Return the plugin groups of each configurable plugin."""
-    found: dict[str, list[str]] = {VLAD: []}
+    groups_of: dict[str, list[str]] = {VLAD: []}
     for group in (
         *(LOCAL_FEATURES, GLOBAL_FEATURES, MATCHERS, POSE_RANKERS, POSE_REFINERS),
         *(SEGMENTERS, DATASETS),
     ):
         for name in plugin_names(group):
-            found.setdefault(name, []).append(group)
-    return found
+            groups_of.setdefault(name, []).append(group)
+    return groups_of
 
 
 def _options_of_plugins(name: str) -> Iterator[Option]:

@@ -22,10 +22,6 @@ from megloc_kapture.errors import MeglocError, OptionError, missing_extra, sugge
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
 
-class Terminated(BaseException):
-    """SIGTERM asks the process to end."""
-
-
 # module:class by name, so that only the requested command is imported
 COMMANDS = {
     "eval": "evaluate_dataset:Eval",
@@ -75,8 +71,8 @@ def _help_texts() -> dict[str, str]:
 def command_class(name: str) -> type[Any]:
     if name in COMMANDS:
         module, _, kind = COMMANDS[name].partition(":")
-        found: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
-        return found
+        command: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
+        return command
     from megloc_kapture.cli.stages import stage_command
 
     return stage_command(name.replace("-", "_"))
@@ -108,8 +104,9 @@ def _parser(given: Sequence[str]) -> Any:
     return functools.reduce(operator.or_, commands)
 
 
-def _terminate(number: int, frame: object) -> NoReturn:
-    raise Terminated
+def _stop(how: str, status: int) -> NoReturn:
+    print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
+    sys.exit(status)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -121,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     debug = False
     try:
         if arguments is None:
-            signal.signal(signal.SIGTERM, _terminate)
+            signal.signal(signal.SIGTERM, lambda *_: _stop("terminated", TERMINATED))
         if list(given) == ["--version"]:
             from megloc_kapture import __version__
 
@@ -135,11 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         debug = command.debug
         status = command.run(command.console()) or DONE
         sys.stdout.flush()
-    except (KeyboardInterrupt, Terminated) as error:
-        terminated = isinstance(error, Terminated)
-        status = TERMINATED if terminated else INTERRUPTED
-        how = "terminated" if terminated else "interrupted"
-        print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
+    except KeyboardInterrupt:
+        _stop("interrupted", INTERRUPTED)
     except Exception as error:
         status = _tell(error, debug)
     sys.exit(status)

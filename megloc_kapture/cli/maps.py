@@ -115,8 +115,8 @@ def report_lines(root: Path) -> list[str]:
         ("", "points", "observations"),
         ("before", report.points_before, report.observations_before),
         *(
-            (one.name.replace("_", " "), f"-{one.points}", f"-{one.observations}")
-            for one in report.filters
+            (step.name.replace("_", " "), f"-{step.points}", f"-{step.observations}")
+            for step in report.filters
         ),
         ("after", report.points_after, report.observations_after),
     ]

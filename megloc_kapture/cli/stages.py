@@ -29,7 +29,6 @@ from megloc_kapture.cli.common import (
     Reading,
     Texts,
     Working,
-    assigned_pairs,
     existing,
 )
 from megloc_kapture.errors import OptionError, check_option, require
@@ -222,7 +221,9 @@ class ExtractGlobal(Reading, StageCommand):
     def run(self, console: Console) -> None:
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture_map(self.input), *map(self.kapture, self.query)]
-        extractors = {one.name: one.make(self.placement()) for one in choices if not one.is_vlad}
+        extractors = {
+            picked.name: picked.make(self.placement()) for picked in choices if not picked.is_vlad
+        }
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for choice in choices:
                 if choice.is_vlad:
@@ -359,7 +360,7 @@ class PairsQuery(Reading, StageCommand):
             f"{query.root}: no local features that the map has as well; give their folder "
             "with --features-dir",
         )
-        return [only_type(mapping, "descriptors", one) for one in asked]
+        return [only_type(mapping, "descriptors", name) for name in asked]
 
 
 def _changes(by: object, topk: int | None) -> dict[str, object]:
@@ -373,7 +374,7 @@ def _retrieval(
     options: PipelineOptions,
 ) -> Retrieval:
     """Return the global-feature types to compare, with the preset's weights."""
-    types = tuple(only_type(mapping, "global_features", one) for one in asked or (None,))
+    types = tuple(only_type(mapping, "global_features", name) for name in asked or (None,))
     how = options.fusion
     if fusion is not None:
         how = how.model_copy(update={"method": fusion})
@@ -476,10 +477,13 @@ class Preprocess(Linked, Computing, Working):
             raise OptionError(f"option {option_fault(error, PreprocessingOptions)}") from error
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
-        takes = "CAMERA=VALUE"
-        for camera, value in assigned_pairs("--bottom-share", self.bottom_share, takes):
-            yield {"camera": camera, "bottom_share": value}
-        for camera, value in assigned_pairs("--polygon", self.polygon, takes):
-            yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
-        for camera, value in assigned_pairs("--mask-file", self.mask_file, takes):
-            yield {"camera": camera, "file": value}
+        for flag, key, texts in (
+            ("--bottom-share", "bottom_share", self.bottom_share),
+            ("--polygon", "polygon", self.polygon),
+            ("--mask-file", "file", self.mask_file),
+        ):
+            for text in texts:
+                camera, _, value = text.rpartition("=")
+                check_option(camera and value, f"{flag} takes CAMERA=VALUE, got {text!r}")
+                corners = [corner.split(",") for corner in value.split()]
+                yield {"camera": camera, key: corners if key == "polygon" else value}

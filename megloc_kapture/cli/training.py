@@ -51,7 +51,7 @@ class Train(Linked, Common):
     features: str | None = None
     """Extractor whose features are matched, or whose detector is frozen; if omitted, superpoint."""
     set: Texts = ()
-    """Change an option: key.key=value (steps=20000, pairs.max_size_px=800); may be repeated."""
+    """Change an option: key.key=value (steps=20000, max_size_px=800); may be repeated."""
     threads: int = 1
     """Threads that prepare pairs."""
     force: Overwrite = False
@@ -60,19 +60,16 @@ class Train(Linked, Common):
     def run(self, console: Console) -> None:
         # torch imports slowly
         from megloc_kapture.pipeline.presets import options_with
-        from megloc_kapture.training.train import TASKS, TrainingData, train
+        from megloc_kapture.training.train import TASKS, train
 
         changes = {} if self.features is None else {"features.name": self.features}
         options = options_with(TASKS[self.task], self.set, changes)
-        data = TrainingData(
-            [self.kapture_map(path) for path in self.input],
-            self.photographs,
-            [self.kapture(path) for path in self.held_out],
-        )
         last = train(
             options,
-            data,
             self.output,
+            kaptures=[self.kapture_map(path) for path in self.input],
+            photographs=self.photographs,
+            held_out=[self.kapture(path) for path in self.held_out],
             force=self.force,
             threads=self.threads,
             work=Work(track=console.track),
@@ -235,10 +232,10 @@ class Render(Linked, Working):
         with single_threaded():
             field = open_field(self.field)
             light = None if self.appearance is None else field.appearance_of(self.appearance)
-            found = field.render(camera, pose, appearance=light)
-        write_image(self.output, found.image)
+            rendered = field.render(camera, pose, appearance=light)
+        write_image(self.output, rendered.image)
         if self.depth is not None:
-            stored = np.clip(np.round(found.depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
+            stored = np.clip(np.round(rendered.depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
             write_bytes(self.depth, cv2.imencode(".png", stored)[1].tobytes())
 
 

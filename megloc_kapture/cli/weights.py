@@ -107,11 +107,11 @@ class Fetch(Common):
         fetch(url, place, sha256=file.sha256, track=console.track)
         state = "sha256 right"
         if file.sha256 is None:
-            found = describe(weights.name, place)
-            state = f"sha256 {sha256_of(found)}, which the registry cannot check"
+            downloaded = describe(weights.name, place)
+            state = f"sha256 {sha256_of(downloaded)}, which the registry cannot check"
             if not file.convert:
                 try:
-                    read_weights(found)
+                    read_weights(downloaded)
                 except DataError:
                     place.unlink()
                     raise
@@ -193,9 +193,9 @@ class WeightsCommand:
 
 
 def summary() -> str:
-    there = [weights.name for weights in registry().values() if _state(weights) == "there"]
-    names = f": {', '.join(there)}" if there else ""
-    return f"{len(there)} of {len(registry())} in {weights_folder()}{names}"
+    present = [weights.name for weights in registry().values() if _state(weights) == "there"]
+    names = f": {', '.join(present)}" if present else ""
+    return f"{len(present)} of {len(registry())} in {weights_folder()}{names}"
 
 
 def _missing(preset: str) -> tuple[str, ...]:
@@ -257,8 +257,10 @@ def _state(weights: Weights) -> str:
 
 
 def _row(weights: Weights) -> dict[str, str]:
-    there = [describe(weights.name, path).published for path in files_of(weights)]
-    file = next((one for one in weights.files if one in there), weights.files[0])
+    present = [describe(weights.name, path).published for path in files_of(weights)]
+    file = next(
+        (candidate for candidate in weights.files if candidate in present), weights.files[0]
+    )
     return {
         "name": f"{weights.name} *" if weights.unverified else weights.name,
         "what for": weights.purpose,

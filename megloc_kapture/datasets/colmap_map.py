@@ -41,6 +41,7 @@ from megloc_kapture.values import Camera
 
 SPARSE, IMAGES, DATABASE = "sparse", "images", "database.db"
 _log = logging.getLogger(__name__)
+_MAPPED_AGAIN = "%s: %s; its images are mapped again with its poses"
 
 _SIFT = "sift"
 
@@ -98,19 +99,15 @@ def find_colmap(
 def _models(path: Path) -> list[Path]:
     around = path if path.name == SPARSE else path / SPARSE
     for places in ([path], [around], sorted(around.glob("*"))):
-        found = [place for place in places if _holds_model(place)]
-        if found:
-            return found
+        folders = [place for place in places if _holds_model(place)]
+        if folders:
+            return folders
     return []
 
 
 def _holds_model(folder: Path) -> bool:
     # one file may be missing: its error comes later
     return any(sum((folder / n).is_file() for n in ns) > 1 for ns in (BINARY_FILES, TEXT_FILES))
-
-
-class OtherFeaturesError(DataError):
-    """A model without descriptors whose features cannot be extracted again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,18 +170,18 @@ class ColmapReconstruction:
             link.unlink()
         link_records(output, self._links())
 
-    def write_map(self, output: Path, *, work: Work = HERE) -> dict[str, float]:
+    def write_map(self, output: Path, *, work: Work = HERE) -> dict[str, float] | None:
         """Write the map into the empty folder ``output`` and return counts for the log.
 
         Without descriptors in a database, ``found_again`` is the share of observations with a
-        re-extracted keypoint.
+        re-extracted keypoint. None, with a warning, if the model's features are not available.
         """
         source = self.source
         local_type = None
         if source.database is not None:
             with ColmapDatabase(source.database) as opened:
-                found = opened.feature_type()
-                local_type = None if found is None else found[0]
+                feature_type = opened.feature_type()
+                local_type = None if feature_type is None else feature_type[0]
         require(
             local_type is not None or source.images is not None,
             "there are no descriptors to match queries with: `megloc import colmap` takes the "
@@ -193,7 +190,8 @@ class ColmapReconstruction:
             path=source.model,
         )
         if not len(self.model.points):
-            raise OtherFeaturesError("the model has no points", path=source.model)
+            _log.warning(_MAPPED_AGAIN, source.model, "the model has no points")
+            return None
         if local_type is None:
             return self._write_with_sift(output, work)
         counts = self._write_reference(
@@ -207,7 +205,7 @@ class ColmapReconstruction:
             )
         return counts
 
-    def _write_with_sift(self, output: Path, work: Work) -> dict[str, float]:
+    def _write_with_sift(self, output: Path, work: Work) -> dict[str, float] | None:
         with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
             reference, images, sift = (Path(scratch) / n for n in ("reference", "images", _SIFT))
             self._write_reference(reference, keypoints_type=_SIFT)
@@ -221,7 +219,8 @@ class ColmapReconstruction:
             except DataError as error:
                 if error.path != reference:
                     raise
-                raise OtherFeaturesError(error.message, path=self.source.model) from None
+                _log.warning(_MAPPED_AGAIN, self.source.model, error.message)
+                return None
         self.link_images(output)  # links pointed to the scratch folder
         return counts
 

@@ -134,8 +134,8 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
     write_sensors(output / MAPPING, data)
     link_images(mapping.root, output / MAPPING)
     names = set(data.image_names())
-    found = read_groups(_tables_beside(mapping))
-    groups = {name: group for name, group in found.items() if name in names}
+    all_groups = read_groups(_tables_beside(mapping))
+    groups = {name: group for name, group in all_groups.items() if name in names}
     write_side_tables(output / SIDE_TABLES, SideTables(protocol=Protocol(), groups=groups))
     return {"map_images": len(names), "map_images_with_pose": len(poses)}
 
@@ -226,7 +226,9 @@ def cameras_of_folder(folder: KaptureFolder) -> tuple[dict[str, Camera], list[Da
 def with_cameras_of_images(folder: KaptureFolder) -> KaptureData:
     """Read a folder and scale its cameras to its images, with a warning."""
     data, (scaled, _) = folder.read(), cameras_of_folder(folder)
-    warn_of_scaled(folder.root, [(data.sensors[key].camera(), one) for key, one in scaled.items()])
+    warn_of_scaled(
+        folder.root, [(data.sensors[key].camera(), scale) for key, scale in scaled.items()]
+    )
     sensors = {
         key: Sensor.from_camera(camera, name=data.sensors[key].name)
         for key, camera in scaled.items()

@@ -19,7 +19,6 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import read_colmap_model
@@ -28,19 +27,13 @@ from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 
 _DEPTHS = ("phoenix/S6/zl548/MegaDepth_v1/{}/dense0/depths", "depth_undistorted/{}")
 _UNDISTORTED, _SCENE_INFO = "Undistorted_SfM", "scene_info"
 _MODELS = ("sparse", "sparse-txt", "sparse/0")
 _ARRAYS = ("image_paths", "intrinsics", "poses")
 _IDENTITY = RigidTransform.identity()
-
-
-class MegaDepthOptions(Options):
-    """Options of importing MegaDepth."""
-
-    scenes: tuple[str, ...] = Field(default=(), description="scene numbers; none: all")
 
 
 @dataclass(frozen=True)
@@ -52,11 +45,10 @@ class _Image:
 
 
 def import_megadepth(
-    root: Path, output: Path, options: MegaDepthOptions | None = None, *, work: Work = HERE
+    root: Path, output: Path, scenes: Sequence[str] = (), *, work: Work = HERE
 ) -> dict[str, int]:
-    """Write each scene as ``output/SCENE``; images without metric depth are omitted."""
-    options = options or MegaDepthOptions()
-    scenes = [check_component(name) for name in options.scenes] or _scenes(root)
+    """Write each scene, by default all, as ``output/SCENE``; without images of no metric depth."""
+    scenes = list(map(check_component, scenes)) or _scenes(root)
     require(scenes, f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
     counts = {"scenes": 0, "images": 0, "without_depth": 0}
     for scene in scenes:
@@ -75,8 +67,6 @@ def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
 
     with reading(path, "an HDF5 file with 'depth'"), h5py.File(path, "r") as file:
         depth_m = np.asarray(file["depth"], np.float32)
-    if depth_m.ndim != 2 or not depth_m.size:
-        raise DataError(f"depth is of shape {depth_m.shape}, not an image", path=path)
     # ordinal depth has negative labels
     if (depth_m < 0).any():
         return None
@@ -120,11 +110,6 @@ def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
     what = "a file of plain arrays (docs/training.md shows how to convert Python objects to these)"
     with reading(table, what), np.load(table, allow_pickle=False) as file:
         images, intrinsics, poses = (file[name] for name in _ARRAYS)
-    shapes = [(len(images), *shape) for shape in ((), (3, 3), (4, 4))]
-    for name, array, shape in zip(_ARRAYS, (images, intrinsics, poses), shapes, strict=True):
-        kinds = "U" if array is images else "fiu"
-        if array.shape != shape or array.dtype.kind not in kinds:
-            raise DataError(f"{name} is {array.dtype} {array.shape}, expected {shape}", path=table)
     for row in np.argsort(images):
         path = safe_join(root, str(images[row]))
         depth = _depth_of(root, scene, path.name)

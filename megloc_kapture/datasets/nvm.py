@@ -47,45 +47,36 @@ class NvmModel:
 
 def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
     """Read the only model of a file; an extra list of unregistered images is ignored."""
-    with reading(path), open(path, encoding="utf-8-sig", errors="surrogateescape") as file:
-        if not file.readline().startswith("NVM_V3"):
-            raise DataError("not an NVM file: the first line must begin with NVM_V3", path=path)
+    with (
+        reading(path, "an NVM file"),
+        named(path),
+        open(path, encoding="utf-8-sig", errors="surrogateescape") as file,
+    ):
+        require(file.readline().startswith("NVM_V3"), "the first line must begin with NVM_V3")
         rows = (line for line in file if line.strip())
-        with named(path):
-            names, cameras = _read_cameras(rows, _count(rows, "cameras"))
-            points = _read_points(rows, _count(rows, "points"), len(names), with_points)
-            more = next(rows, "0").strip()
-            if more.isdecimal() and list(islice(rows, int(more))) and _count(rows, "points"):
-                raise DataError("the file has several models, expected one")
+        names, cameras = _read_cameras(rows, int(next(rows, "")))
+        points = _read_points(rows, int(next(rows, "")), len(names), with_points)
+        more = next(rows, "0").strip()
+        if more.isdecimal() and list(islice(rows, int(more))) and int(next(rows, "0")):
+            raise DataError("the file has several models, expected one")
     columns = cameras[:, 0], cameras[:, 1:5], cameras[:, 5:8], 0.0 - cameras[:, 8]  # not -0.0
     return NvmModel(names, *columns, points)
-
-
-def _count(rows: Iterator[str], what: str) -> int:
-    text = next(rows, "").strip()
-    require(text.isdecimal(), f"expected the number of {what}, got {text[:40]!r}")
-    return int(text)
 
 
 def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDArray[np.float64]]:
     cameras: dict[str, list[float]] = {}
     for row in islice(rows, count):
-        text, *fields = row.split()
-        with named(about=f"camera {text!r}"):
-            name = check_relative(text.removeprefix("./"))
-            try:
-                focal, *pose, k, _ = map(float, fields)
-                w, x, y, z, *center = pose
-            except ValueError as error:
-                raise DataError(f"expected 10 numbers: {error}") from error
-            values = [focal, *unit_quaternion((w, x, y, z)), *center, k]
-            if len(values) != 9 or not np.isfinite(values).all() or name in cameras:
-                raise DataError("expected 10 finite numbers, and each image once")
-        cameras[name] = values
+        name, *fields = row.split()
+        with named(about=f"camera {name!r}"):
+            focal, w, x, y, z, *center, k, _ = map(float, fields)
+            quat_wxyz = unit_quaternion((w, x, y, z))
+            cameras[check_relative(name.removeprefix("./"))] = [focal, *quat_wxyz, *center, k]
     require(
-        cameras and len(cameras) >= count, f"the file ends after {len(cameras)} of {count} cameras"
+        cameras and len(cameras) == count, f"{len(cameras)} of {count} cameras, each image once"
     )
-    return tuple(cameras), np.array(list(cameras.values()))
+    values = np.array(list(cameras.values())).reshape(-1, 9)
+    require(np.isfinite(values).all(), "not all cameras are finite")
+    return tuple(cameras), values
 
 
 def _read_points(rows: Iterator[str], count: int, images: int, with_points: bool) -> SparsePoints:
@@ -101,19 +92,19 @@ def _read_points(rows: Iterator[str], count: int, images: int, with_points: bool
 
 
 def _parse_points(lines: list[str], images: int) -> SparsePoints:
-    try:
-        values = np.array([value for line in lines for value in line.split()], np.float64)
-        starts, at = [], 0
-        for _ in lines:
-            starts.append(at)
-            at += 7 + 4 * int(values[at + 6])
-        if at != len(values) or not np.isfinite(values).all():
-            raise ValueError("wrong number of fields, or a number that is not finite")
-    except (ValueError, IndexError, OverflowError) as error:
-        raise DataError(f"broken points from {lines[0][:40]!r} on: {error}") from error
+    values = np.array([value for line in lines for value in line.split()], np.float64)
+    starts, at = [], 0
+    for _ in lines:
+        starts.append(at)
+        at += 7 + 4 * int(values[at + 6])
     is_head = np.zeros(len(values), np.bool_)
     is_head[np.array(starts)[:, None] + np.arange(7)] = True
     heads, seen = values[is_head].reshape(-1, 7), values[~is_head].reshape(-1, 4)
-    if len(seen) and (seen[:, :2].min() < 0 or seen[:, 0].max() >= images):
-        raise DataError(f"a point names an unknown image, from {lines[0][:40]!r} on")
+    require(
+        at == len(values)
+        and np.isfinite(values).all()
+        and (seen[:, :2] >= 0).all()
+        and (seen[:, 0] < images).all(),
+        f"a point is broken or names an unknown image, from {lines[0][:40]!r} on",
+    )
     return SparsePoints.of_rows(heads[:, :6], heads[:, 6], seen)

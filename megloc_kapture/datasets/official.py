@@ -18,8 +18,9 @@ from megloc_kapture.datasets.kapture_folders import (
     is_kapture,
     tell_of_truth_without_query,
 )
-from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
+from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     ImageGroup,
@@ -114,8 +115,9 @@ class OfficialDataset(SideTables):
     """A dataset with its tables; poses are in the local frame.
 
     ``links`` maps folders below ``records_data`` to folders of the dataset (``""`` is
-    ``records_data`` itself), ``image_files`` maps other images to files. ``write_more`` writes
-    further files (depth maps) below the output folder.
+    ``records_data`` itself), ``image_files`` maps other images to files. ``reference`` reads the
+    image names and points of the dataset's model. ``write_more`` writes further files (depth maps)
+    below the output folder.
     """
 
     mapping: KaptureData
@@ -127,7 +129,8 @@ class OfficialDataset(SideTables):
     summary: Sequence[Count] = ()
     remarks: Sequence[str] = ()
     missing: Missing | None = None
-    reference: ReferenceModel | None = None
+    reference: Callable[[], tuple[Sequence[str], SparsePoints]] | None = None
+    reference_database: Path | None = None
     write_more: Callable[[Path], None] | None = None
 
 
@@ -157,14 +160,14 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
         write_sensors(output / QUERY_GT, dataset.query_gt)
     write_side_tables(output / SIDE_TABLES, dataset)
     if dataset.reference is not None:
-        model_names, points = dataset.reference.read()
+        model_names, points = dataset.reference()
         write_reference_map(
             output / REFERENCE,
             dataset.mapping,
             dataset.links,
             model_names,
             points,
-            database=dataset.reference.database,
+            database=dataset.reference_database,
         )
     if dataset.write_more is not None:
         dataset.write_more(output)
@@ -234,12 +237,12 @@ class KaptureForm:
         """Find the folders below a root; return None without a map."""
         patterns = _FOLDERS_OF_LOCATIONS if with_locations else _FOLDERS
         for parent in (Path(root) / name for name in _PARENTS):
-            found = [
-                [one for one in sorted(parent.glob(pattern)) if is_kapture(one)]
+            candidates = [
+                [path for path in sorted(parent.glob(pattern)) if is_kapture(path)]
                 for pattern in patterns
             ]
-            if found[0]:
-                return cls(parent, tuple(one for folders in found for one in folders))
+            if candidates[0]:
+                return cls(parent, tuple(path for folders in candidates for path in folders))
         return None
 
     def read(self, missing: Missing) -> list[KaptureImage]:
@@ -277,11 +280,11 @@ class KaptureForm:
 
     def rig(self) -> dict[str, RigidTransform]:
         """Return ``sensor_from_rig`` by sensor id; the first folder wins."""
-        found: dict[str, RigidTransform] = {}
+        poses: dict[str, RigidTransform] = {}
         for path in self.folders:
             for members in KaptureFolder(path).read().rigs.values():
-                found = {**members, **found}
-        return found
+                poses = {**members, **poses}
+        return poses
 
     def without_model(self) -> OptionError:
         return OptionError(

@@ -7,9 +7,8 @@ folders. Here they are opened as ``immutable``, which creates no files even in W
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
@@ -69,29 +68,35 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         except BaseException:
             self._connection.close()
             raise
+        self._by_stem = {_without_suffix(name): name for name in self.images}
 
     def __exit__(self, *raised: object) -> None:
         self._connection.close()
 
+    def name_of(self, image: str) -> str | None:
+        """Return the stored name of an image, which may have another suffix."""
+        return image if image in self.images else self._by_stem.get(_without_suffix(image))
+
     def keypoints(self, name: str) -> NDArray[np.float32]:
         """Return the keypoints of an image, float32 (N, 2), COLMAP pixels."""
-        found = self._array("keypoints", name, "<f4")
-        return np.empty((0, 2), np.float32) if found is None else np.ascontiguousarray(found[:, :2])
+        rows = self._array("keypoints", name, "<f4")
+        return np.empty((0, 2), np.float32) if rows is None else np.ascontiguousarray(rows[:, :2])
 
     def feature_type(self) -> tuple[str, str] | None:
         """Return the type of all features, or None without descriptors."""
         with self._reading():
-            if self._has_types():
+            columns = self._rows("PRAGMA table_info(descriptors)")
+            if any(column[1] == "type" for column in columns):
                 rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
                 kinds = {int(kind) for (kind,) in rows}
             else:  # before version 4: SIFT, or imported features
                 rows = self._rows("SELECT DISTINCT cols FROM descriptors WHERE rows > 0")
                 kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for (size,) in rows}
-        found = [_TYPES.get(kind) or (f"colmap-{kind}", "u1") for kind in kinds]
-        if len(found) > 1:
-            names = ", ".join(sorted(name for name, _ in found))
+        types = [_TYPES.get(kind) or (f"colmap-{kind}", "u1") for kind in kinds]
+        if len(types) > 1:
+            names = ", ".join(sorted(name for name, _ in types))
             raise self._error(f"has descriptors of several types: {names}")
-        return found[0] if found else None
+        return types[0] if types else None
 
     def descriptors(self, name: str, dtype: str = "u1") -> NDArray[Any] | None:
         """Return the descriptors of an image, (N, D) of the type's dtype, or None."""
@@ -112,9 +117,6 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             raise self._error(f"{table} of {name!r} are not finite")
         return array
 
-    def _has_types(self) -> bool:
-        return any(row[1] == "type" for row in self._rows("PRAGMA table_info(descriptors)"))
-
     def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
         return self._connection.execute(query)
 
@@ -129,25 +131,10 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
 _MAX_SHIFT_PX = 1.0
 
 
-@dataclass(frozen=True)
-class ReferenceModel:
-    """A dataset's model: a reader of image names and points, and its feature database, if any."""
-
-    read: Callable[[], tuple[Sequence[str], SparsePoints]]
-    published_database: Path | None
-
-    @property
-    def database(self) -> Path | None:
-        path = self.published_database
-        return path if path is not None and path.is_file() else None
-
-    def remarks(self) -> list[str]:
-        if self.database is not None:
-            return []
-        return [
-            "The reference model comes without descriptors: its database is not there. "
-            "`megloc localize` extracts them again from the images."
-        ]
+WITHOUT_DATABASE = (
+    "The reference model comes without descriptors: its database is not there. "
+    "`megloc localize` extracts them again from the images."
+)
 
 
 def check_model_files(files: Iterable[Path]) -> None:
@@ -184,41 +171,45 @@ def write_reference_map(
     link_records(output, links)
     write_points3d(output, np.concatenate([points.xyz, points.rgb], axis=1))
     names = tuple(sorted(set(data.records_camera.values()).intersection(image_names)))
+    config = FeatureConfig(keypoints_type.upper(), np.dtype(np.float32), 2)
+    writer = FeatureWriter(output, "keypoints", keypoints_type, config)
+    positions = {name: position for position, name in enumerate(image_names)}
+    order = np.argsort(points.image_ids, kind="stable")
+    ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
+    keypoint_ids = np.full(len(order), -1, np.int32)  # -1: omitted observation
+    new_ids = np.zeros(len(image_names), np.int32)
+    lengths, sources = dict[str, int](), dict[str, str]()  # keypoints, and names in the database
     with ExitStack() as stack:
         source = None
         if database is not None:
-            opened = stack.enter_context(ColmapDatabase(database))
-            source = stack.enter_context(
-                _DatabaseFeatures(opened, output, keypoints_type, database_names or {})
+            source = stack.enter_context(ColmapDatabase(database))
+            feature_type = source.feature_type() or (keypoints_type, "u1")
+            require(
+                feature_type[0] == keypoints_type,
+                f"has features of type {feature_type[0]}, not {keypoints_type}",
+                path=database,
             )
-        config = FeatureConfig(keypoints_type.upper(), np.dtype(np.float32), 2)
-        writer = FeatureWriter(output, "keypoints", keypoints_type, config)
-        stack.enter_context(writer)
-        positions = {name: position for position, name in enumerate(image_names)}
-        order = np.argsort(points.image_ids, kind="stable")
-        ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
-        keypoint_ids = np.full(len(order), -1, np.int32)  # -1: omitted observation
-        new_ids = np.zeros(len(image_names), np.int32)
-        num_keypoints = 0
+            stored = {
+                name: source.name_of((database_names or {}).get(name, name)) for name in names
+            }
+            sources = {image: name for image, name in stored.items() if name is not None}
         for new_id, name in enumerate(names):
             position = positions[name]
             new_ids[position] = new_id
             rows = order[ends[position] : ends[position + 1]]
             features, xy_px = points.feature_ids[rows].astype(np.int64), points.xy_px[rows]
-            if source is None:
-                _, first, numbers = np.unique(features, return_index=True, return_inverse=True)
-                keypoints = xy_px[first]
-            else:
-                keypoints, numbers = source.of_image(name, features, xy_px), features
+            keypoints, numbers = _keypoints_of(source, name, sources.get(name), features, xy_px)
             if scales and name in scales:
                 keypoints = keypoints * np.array(scales[name], np.float32)
-            num_keypoints += len(keypoints)
+            lengths[name] = len(keypoints)
             # with a database, images without features get empty files
             if len(keypoints) or source is not None:
                 writer.write(name, keypoints)
             pairs = np.stack([points.point_ids[rows], numbers], axis=1)
             _, first = np.unique(pairs, axis=0, return_index=True)  # each pair once
             keypoint_ids[rows[first]] = numbers[first]
+        if source is not None:
+            _write_descriptors(source, output, feature_type, lengths, sources)
     kept = np.flatnonzero(keypoint_ids >= 0)
     observations = Observations(
         keypoints_type,
@@ -230,76 +221,68 @@ def write_reference_map(
     write_observations(output, {keypoints_type: observations})
     return {
         "images": len(names),
-        "keypoints": num_keypoints,
+        "keypoints": sum(lengths.values()),
         "points": len(points),
         "observations": len(observations),
     }
 
 
-class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
-    def __init__(
-        self, database: ColmapDatabase, output: Path, keypoints_type: str, names: Mapping[str, str]
-    ) -> None:
-        self._database = database
-        self._type, self._dtype = database.feature_type() or (keypoints_type, "u1")
-        if self._type != keypoints_type:
-            raise self._error(f"has features of type {self._type}, not {keypoints_type}")
-        self._output, self._names = output, names
-        self._by_stem = {_without_suffix(name): name for name in database.images}
-        self._writer: FeatureWriter | None = None
-        self._without: list[str] = []
+def _keypoints_of(
+    database: ColmapDatabase | None,
+    name: str,
+    stored: str | None,
+    features: NDArray[np.int64],
+    xy_px: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the keypoints of an image, and the row of each of the model's features in them.
 
-    def of_image(
-        self, name: str, features: NDArray[np.int64], xy_px: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return the keypoints of an image; they must agree with the model's features."""
-        name_there = self._name_there(name)
-        if name_there is None:
-            if len(features):
-                raise self._error(f"has no image {name!r}")
-            self._without.append(name)
-            return np.empty((0, 2), np.float32)
-        keypoints = self._database.keypoints(name_there)
-        fits = features.max(initial=-1) < len(keypoints)
-        if fits:
-            shifts = np.abs(keypoints[features] - xy_px)
-            fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
-        if not fits:
-            raise self._error(f"is not of this model: its features of {name_there!r} are others")
-        descriptors = self._database.descriptors(name_there, self._dtype)
-        if descriptors is not None:
-            self._write(name, descriptors, len(keypoints))
-        elif len(keypoints) == 0:
-            self._without.append(name)
-        return keypoints
+    ``stored`` is the image's name in the database, whose keypoints must agree with the model's.
+    """
+    if database is None:
+        _, first, rows = np.unique(features, return_index=True, return_inverse=True)
+        return xy_px[first], rows
+    if stored is None:
+        require(not len(features), f"has no image {name!r}", path=database.path)
+        return np.empty((0, 2), np.float32), features
+    keypoints = database.keypoints(stored)
+    fits = features.max(initial=-1) < len(keypoints)
+    if fits:
+        shifts = np.abs(keypoints[features] - xy_px)
+        fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
+    require(
+        fits, f"is not of this model: its features of {stored!r} are others", path=database.path
+    )
+    return keypoints, features
 
-    def __exit__(self, *raised: object) -> None:
-        if self._writer is not None:
-            for name in self._without:
-                config = self._writer.config
-                self._writer.write(name, np.empty((0, config.dsize), config.dtype))
 
-    def _name_there(self, name: str) -> str | None:
-        name = self._names.get(name, name)
-        if name in self._database.images:
-            return name
-        return self._by_stem.get(_without_suffix(name))
-
-    def _write(self, name: str, descriptors: NDArray[Any], num_keypoints: int) -> None:
-        kind, size = self._type, descriptors.shape[1]
-        if self._writer is None:
-            config = FeatureConfig(kind.upper(), descriptors.dtype, size, kind, "L2")
-            self._writer = FeatureWriter(self._output, "descriptors", kind, config)
-        expected = (num_keypoints, self._writer.config.dsize)
-        require(
-            descriptors.shape == expected,
-            f"descriptors of {name!r} have the shape {descriptors.shape}, expected {expected}",
-            path=self._database.path,
-        )
-        self._writer.write(name, descriptors)
-
-    def _error(self, message: str) -> DataError:
-        return DataError(message, path=self._database.path)
+def _write_descriptors(
+    database: ColmapDatabase,
+    output: Path,
+    feature_type: tuple[str, str],
+    lengths: Mapping[str, int],
+    sources: Mapping[str, str],
+) -> None:
+    """Write the descriptors of images with ``lengths`` keypoints; ``sources`` name them there."""
+    (kind, dtype), size = feature_type, 0
+    writer: FeatureWriter | None = None
+    for name in sorted(lengths, key=lambda name: lengths[name] == 0):  # sizes before empty files
+        rows = database.descriptors(sources[name], dtype) if name in sources else None
+        if rows is not None:
+            size = size or rows.shape[1]
+            require(
+                rows.shape == (lengths[name], size),
+                f"descriptors of {name!r} have the shape {rows.shape}, expected "
+                f"{(lengths[name], size)}",
+                path=database.path,
+            )
+        elif lengths[name] == 0 and size:
+            rows = np.empty((0, size), dtype)
+        else:
+            continue
+        if writer is None:
+            config = FeatureConfig(kind.upper(), np.dtype(dtype), size, kind, "L2")
+            writer = FeatureWriter(output, "descriptors", kind, config)
+        writer.write(name, rows)
 
 
 def _without_suffix(name: str) -> str:

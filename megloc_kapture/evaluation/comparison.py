@@ -127,16 +127,11 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
     if len(set(labels)) != len(labels):
         raise OptionError(f"two results are called {max(labels, key=labels.count)!r}")
     for other in evaluations[1:]:
-        for kind, ours, theirs in (
-            ("thresholds", first.thresholds, other.thresholds),
-            ("queries", first.errors.names, other.errors.names),
-            (
-                "conditions",
-                [query.condition for query in first.queries],
-                [query.condition for query in other.queries],
-            ),
-        ):
-            check_option(ours == theirs, f"{first.label} and {other.label} have different {kind}")
+        both = f"{first.label} and {other.label} have different"
+        check_option(first.thresholds == other.thresholds, f"{both} thresholds")
+        check_option(first.errors.names == other.errors.names, f"{both} queries")
+        conditions = ([q.condition for q in e.queries] for e in (first, other))
+        check_option(next(conditions) == next(conditions), f"{both} conditions")
 
 
 def mcnemar(only_first: int, only_second: int) -> float:

@@ -286,20 +286,17 @@ def _read_mlad(
     poses: dict[RelocalizationPair, RigidTransform] = {}
     for file, pose_file in paths.items():
         for row in pose_files.read_mlad_file(pose_file):
-            asked_pair = asked[file].get((row.reference, row.query))
+            asked_pair, pose = asked[file].get((row.reference, row.query)), row.query_from_reference
             if asked_pair is None:
                 problem = f"pair {row.reference} {row.query} is not asked for"
-            elif row.query_from_reference is None:
-                problem = "has pairs without poses, as a relocalization file"
-            elif asked_pair.reference not in references:
+                raise DataError(problem, path=pose_file)
+            if pose is None:
+                raise DataError("has pairs without poses, as a relocalization file", path=pose_file)
+            if asked_pair.reference not in references:
                 problem = f"reference {asked_pair.reference!r} has no pose in the map"
-            else:
-                pose = pose_files.scaled_pose(
-                    row.query_from_reference, 1 / world.official_from_local.scale
-                )
-                # the identity fills in for a missing pose: the file must have every row
-                if row.query_from_reference != RigidTransform.identity():
-                    poses[asked_pair] = pose @ references[asked_pair.reference]
-                continue
-            raise DataError(problem, path=pose_file)
+                raise DataError(problem, path=pose_file)
+            # the identity fills in for a missing pose: the file must have every row
+            if pose != RigidTransform.identity():
+                local = pose_files.scaled_pose(pose, 1 / world.official_from_local.scale)
+                poses[asked_pair] = local @ references[asked_pair.reference]
     return poses

@@ -303,29 +303,16 @@ def query_result(
         reason = status.reason or "status says localized, but the result has no pose"
     known = {each.name: getattr(status, each.name) for each in fields(LocalizationResult)}
     known |= {"cam_from_world": pose, "reason": reason, "name": image}
+    if pose is None:
+        known["fallback"] = "none"
     return QueryResult(
-        **known | ({"fallback": "none"} if pose is None else {}),
+        **known,
         image=image,
         condition=conditions.get(image, ""),
         outcome=outcome,
         position_m=errors[0],
         angle_deg=errors[1],
     )
-
-
-def relative_translation_errors(
-    estimated: tuple[NDArray[np.float64], NDArray[np.float64]],
-    truth: tuple[NDArray[np.float64], NDArray[np.float64]],
-    references: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> NDArray[np.float64]:
-    """Return ``|t - t_true|`` (N,) of ``query_from_reference``.
-
-    Arguments are quaternions (N, 4) and translations (N, 3) of ``cam_from_world`` in one frame.
-    """
-    world_from_reference = invert(*references)
-    _, translations = compose(*estimated, *world_from_reference)
-    _, true_translations = compose(*truth, *world_from_reference)
-    return np.asarray(np.linalg.norm(translations - true_translations, axis=1), dtype=np.float64)
 
 
 def evaluate_pairs(
@@ -372,12 +359,15 @@ def evaluate_pairs(
     names = by_center.errors.names
     has_pose = by_center.errors.has_pose
     posed = [name for name, has in zip(names, has_pose, strict=True) if has]
-    position_m = np.full(len(names), np.inf)
-    position_m[has_pose] = relative_translation_errors(
-        stack_poses(estimated[named[name]] for name in posed),
-        stack_poses(truth[named[name].query] for name in posed),
-        stack_poses(references[named[name].reference] for name in posed),
+    world_from_reference = invert(*stack_poses(references[named[name].reference] for name in posed))
+    _, translations = compose(
+        *stack_poses(estimated[named[name]] for name in posed), *world_from_reference
     )
+    _, true_translations = compose(
+        *stack_poses(truth[named[name].query] for name in posed), *world_from_reference
+    )
+    position_m = np.full(len(names), np.inf)
+    position_m[has_pose] = np.linalg.norm(translations - true_translations, axis=1)
     errors = PoseErrors(names, position_m, by_center.errors.angle_deg)
     queries = tuple(
         replace(query, position_m=error_m)

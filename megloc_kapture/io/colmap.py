@@ -97,8 +97,8 @@ def undistorted_pinhole(camera: Camera) -> Camera:
     pycolmap = load_pycolmap()
     options = pycolmap.UndistortCameraOptions()
     options.blank_pixels = 0.0
-    found = pycolmap.undistort_camera(options, colmap_camera(camera))
-    return replace(Camera.from_colmap(found), focal_deviation=camera.focal_deviation)
+    pinhole = pycolmap.undistort_camera(options, colmap_camera(camera))
+    return replace(Camera.from_colmap(pinhole), focal_deviation=camera.focal_deviation)
 
 
 def focal_from_exif(jpeg: bytes) -> float | None:
@@ -131,8 +131,8 @@ def focal_from_matches(
     options.ransac.max_error = max_error_px
     options.ransac.random_seed = seed
     changed = new_colmap_camera(camera)
-    found = pycolmap.estimate_absolute_pose(points_px[usable], points[usable], changed, options)
-    return None if found is None else float(changed.mean_focal_length())
+    estimate = pycolmap.estimate_absolute_pose(points_px[usable], points[usable], changed, options)
+    return None if estimate is None else float(changed.mean_focal_length())
 
 
 # ------------------------------------------------------------------------------- triangulation
@@ -267,10 +267,10 @@ def _cameras_of(images: Sequence[MapImage]) -> tuple[list[Any], list[int]]:
 
 def numbered_cameras(cameras: Iterable[Camera]) -> list[Any]:
     """Convert cameras to COLMAP's, numbered from 1."""
-    found = [new_colmap_camera(camera) for camera in cameras]
-    for camera_id, camera in enumerate(found, start=1):
+    numbered = [new_colmap_camera(camera) for camera in cameras]
+    for camera_id, camera in enumerate(numbered, start=1):
         camera.camera_id = camera_id
-    return found
+    return numbered
 
 
 def write_database(
@@ -310,13 +310,13 @@ def write_database(
             rows = np.ascontiguousarray(pairs, dtype=np.uint32)
             database.write_matches(i + 1, j + 1, rows)
             if geometry is None:
-                found = pycolmap.TwoViewGeometry()
-                found.inlier_matches = rows
+                two_view = pycolmap.TwoViewGeometry()
+                two_view.inlier_matches = rows
                 # with UNDEFINED, pycolmap 4.2 silently triangulates nothing
-                found.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                two_view.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             else:
-                found = geometry(i, j, rows)
-            database.write_two_view_geometry(i + 1, j + 1, found)
+                two_view = geometry(i, j, rows)
+            database.write_two_view_geometry(i + 1, j + 1, two_view)
     database.close()
 
 
@@ -341,17 +341,17 @@ def _posed_reconstruction(
 
 def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPoints:
     # COLMAP's point order depends on its threads; sort by track
-    found = [
+    tracks = [
         (sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements), point)
         for _, point in sorted(reconstruction.points3D.items())
     ]
-    found.sort(key=lambda pair: pair[0])
-    lengths = np.array([len(track) for track, _ in found], dtype=np.int64)
-    flat = np.array([e for track, _ in found for e in track], dtype=np.int64).reshape(-1, 2)
+    tracks.sort(key=lambda pair: pair[0])
+    lengths = np.array([len(track) for track, _ in tracks], dtype=np.int64)
+    flat = np.array([e for track, _ in tracks for e in track], dtype=np.int64).reshape(-1, 2)
     return TriangulatedPoints(
-        xyz=np.array([p.xyz for _, p in found], dtype=np.float64).reshape(-1, 3) + offset,
-        errors_px=np.array([p.error for _, p in found], dtype=np.float64),
-        point_ids=np.repeat(np.arange(len(found), dtype=np.int64), lengths),
+        xyz=np.array([p.xyz for _, p in tracks], dtype=np.float64).reshape(-1, 3) + offset,
+        errors_px=np.array([p.error for _, p in tracks], dtype=np.float64),
+        point_ids=np.repeat(np.arange(len(tracks), dtype=np.int64), lengths),
         image_ids=flat[:, 0],
         keypoint_ids=flat[:, 1],
     )

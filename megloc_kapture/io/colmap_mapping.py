@@ -70,8 +70,8 @@ def extract_sift(
     bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image)).clone_as_grey()
     # not cached: an extractor holds a pyramid, which two threads would share
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    found, descriptors = extractor.extract(bitmap)
-    rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found]
+    detected, descriptors = extractor.extract(bitmap)
+    rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in detected]
     keypoints = np.array(rows, dtype=np.float32).reshape(-1, 4)
     return keypoints, np.array(descriptors.data, dtype=np.uint8).reshape(-1, 128)
 
@@ -137,13 +137,13 @@ def reconstruct(
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = seed
         first, second = (cameras[images[at][1] - 1] for at in (i, j))
-        found = pycolmap.estimate_two_view_geometry(
+        two_view = pycolmap.estimate_two_view_geometry(
             first, points[0], second, points[1], rows, options
         )
-        if len(inliers := found.inlier_matches):
+        if len(inliers := two_view.inlier_matches):
             apart = points[0][inliers[:, 0]] - points[1][inliers[:, 1]]
-            seen.append((found.config, float(np.median(np.linalg.norm(apart, axis=1)))))
-        return found
+            seen.append((two_view.config, float(np.median(np.linalg.norm(apart, axis=1)))))
+        return two_view
 
     sizes = [len(photograph.keypoints_px) for photograph in photographs]
     with database_folder(scratch, sizes, matches) as folder, quiet_stderr():
@@ -156,11 +156,11 @@ def reconstruct(
         (Path(folder) / "result").mkdir()
         run = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
         made = _options(mapper, cameras, seed, known_cameras)
-        found = run(str(database), folder, str(Path(folder) / "result"), made) if seen else {}
+        results = run(str(database), folder, str(Path(folder) / "result"), made) if seen else {}
     doubtful = {p.name for p in photographs if p.doubtful} if not known_cameras else set()
     others: dict[str, str] = {}
-    for _, each in sorted(found.items()):
-        others |= _other_cameras(each, doubtful)
+    for _, result in sorted(results.items()):
+        others |= _other_cameras(result, doubtful)
     if others:
         again = [
             replace(p, sensor=others.get(p.name, p.sensor), doubtful=False) for p in photographs
@@ -168,8 +168,8 @@ def reconstruct(
         return reconstruct(again, matches, mapper, seed=seed, scratch=scratch)
     models = [
         model
-        for _, found_one in sorted(found.items())
-        for model in connected_models(found_one, sensors)
+        for _, result in sorted(results.items())
+        for model in connected_models(result, sensors)
     ]
     models = [m for m in models if len(m.poses) >= MIN_IMAGES and m.num_points >= _MIN_POINTS]
     if not models:
@@ -236,7 +236,7 @@ def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, 
     with quiet_stderr():
         pycolmap.bundle_adjustment(apart, options)
     after = _errors_px(apart)
-    found: dict[str, str] = {}
+    camera_of: dict[str, str] = {}
     for camera_id in sorted(camera_id for camera_id, number in sharing.items() if number > 1):
         members = [image for image in images if image.camera_id == camera_id]
         focal = np.array([apart.cameras[image.image_id].mean_focal_length() for image in members])
@@ -252,9 +252,9 @@ def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, 
         for (zoom, name), (next_zoom, _) in pairwise([*others, (math.inf, "")]):
             group.append(name)
             if next_zoom - zoom > _OTHER_ZOOM:
-                found |= dict.fromkeys(group, min(group))
+                camera_of |= dict.fromkeys(group, min(group))
                 group = []
-    return found
+    return camera_of
 
 
 def _errors_px(reconstruction: Any) -> dict[int, float]:
@@ -263,7 +263,7 @@ def _errors_px(reconstruction: Any) -> dict[int, float]:
     for _, point in sorted(reconstruction.points3D.items()):
         for element in point.track.elements:
             errors[element.image_id].append(point.error)
-    return {number: float(np.mean(one)) if one else 0.0 for number, one in errors.items()}
+    return {number: float(np.mean(values)) if values else 0.0 for number, values in errors.items()}
 
 
 def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]:
@@ -300,9 +300,9 @@ def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]
             camera = reconstruction.cameras[image.camera_id]
             of_image[image.name] = sensors[image.camera_id - 1]
             cameras[of_image[image.name]] = Camera.from_colmap(camera)
-            found = image.cam_from_world()
+            pose = image.cam_from_world()
             poses[image.name] = RigidTransform.from_matrix(
-                found.rotation.matrix(), np.asarray(found.translation)
+                pose.rotation.matrix(), np.asarray(pose.translation)
             )
         error_px = float(np.mean([points[row].error for row in kept]))
         models.append(Model(cameras, of_image, poses, len(kept), error_px))
@@ -382,5 +382,5 @@ def read_map(path: Path) -> NDArray[np.float32]:
     with reading(path, "a map of COLMAP's stereo"):
         *sizes, values = path.read_bytes().split(b"&", 3)
         width, height, channels = (int(size) for size in sizes)
-        found = np.frombuffer(values, "<f4").astype(np.float32).reshape(channels, height, width)
-    return found[0] if channels == 1 else np.ascontiguousarray(found.transpose(1, 2, 0))
+        pixels = np.frombuffer(values, "<f4").astype(np.float32).reshape(channels, height, width)
+    return pixels[0] if channels == 1 else np.ascontiguousarray(pixels.transpose(1, 2, 0))

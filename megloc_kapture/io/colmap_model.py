@@ -225,7 +225,7 @@ def _points(model: Any, images: Sequence[ColmapImage]) -> SparsePoints:
     heads, lengths, observations = [], [], []
     features = {image.image_id: model.images[image.image_id].points2D for image in images}
     for _, point in sorted(model.points3D.items()):
-        track = [(one.image_id, one.point2D_idx) for one in point.track.elements]
+        track = [(element.image_id, element.point2D_idx) for element in point.track.elements]
         heads.append((*point.xyz, *point.color))
         lengths.append(len(track))
         observations += [

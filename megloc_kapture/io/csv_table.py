@@ -41,8 +41,8 @@ def read_csv_table(
         if len(set(header)) != len(header) or not (
             set(columns).difference(optional) <= set(header) <= set(columns)
         ):
-            expected, found = ",".join(columns), " ".join(",".join(header).split())
-            message = f"the header must name the columns {expected}; it reads {found!r}"
+            expected, actual = ",".join(columns), " ".join(",".join(header).split())
+            message = f"the header must name the columns {expected}; it reads {actual!r}"
             raise DataError(message, path=path, line=1)
         for fields in filter(None, reader):
             if len(fields) != len(header):

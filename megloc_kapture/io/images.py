@@ -64,7 +64,10 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
     image = _decoded_by_opencv(content)
     if image is None:
         with reading(path, "an image"):
-            image = _decoded_by_pillow(content)
+            from PIL import Image
+
+            with Image.open(BytesIO(content)) as opened:
+                image = pillow_pixels(opened)
     else:
         _check_complete(path, content)
     return with_8_bits(image)
@@ -80,13 +83,6 @@ def _decoded_by_opencv(content: bytes) -> NDArray[Any] | None:
     except cv2.error:
         return None
     return None if image is None else np.asarray(image)[:, :, ::-1]
-
-
-def _decoded_by_pillow(content: bytes) -> NDArray[Any]:
-    from PIL import Image
-
-    with Image.open(BytesIO(content)) as image:
-        return pillow_pixels(image)
 
 
 def pillow_pixels(image: Image.Image) -> NDArray[np.uint8]:
@@ -355,16 +351,16 @@ def _centred(width: int, height: int, focal: float, deviation: float) -> Camera:
 
 def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     """Return latitude, longitude and height from EXIF's GPS table (EXIF 2.3, table 15)."""
-    found = []
+    degrees = []
     for reference, tag, sides in ((1, 2, "NS"), (3, 4, "EW")):
         side, parts = _text(gps.get(reference))[:1].upper(), _numbers(gps.get(tag))
         if side not in sides or not side or not parts:
             return None
         value = sum(part / 60**at for at, part in enumerate(parts[:3]))
-        found.append(-value if side == sides[1] else value)
+        degrees.append(-value if side == sides[1] else value)
     below = gps.get(5) in (1, b"\x01")
     height = (_number(gps.get(6)) or 0.0) * (-1 if below else 1)
-    return found[0], found[1], height
+    return degrees[0], degrees[1], height
 
 
 def _blank_with_exif(exif: Image.Exif, make: str, model: str, size: tuple[int, int]) -> bytes:

@@ -103,11 +103,13 @@ def staged_output(
 
 
 def _files_below(folder: Path) -> set[str]:
-    found = set()
+    files_below = set()
     for place, folders, files in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
-        found |= {os.path.relpath(os.path.join(place, name), folder) for name in files + links}
-    return found
+        files_below |= {
+            os.path.relpath(os.path.join(place, name), folder) for name in files + links
+        }
+    return files_below
 
 
 def _remove_old_files(folder: Path, names: Iterable[str]) -> None:

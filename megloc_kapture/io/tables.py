@@ -121,14 +121,14 @@ _COVARIANCE_COLUMNS = ("image", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPP
 
 def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
     """Read covariances (6, 6) by image from their upper triangles ``rx_rx, rx_ry, ... tz_tz``."""
-    found = {}
+    by_image = {}
     with reading(path, "a table of covariances"):
         for _, row in read_csv_table(path, _COVARIANCE_COLUMNS):
             image, *texts = (row[name] for name in _COVARIANCE_COLUMNS)
             covariance = np.empty((6, 6))
             covariance[_UPPER] = covariance.T[_UPPER] = [float(text) for text in texts]
-            found[image] = covariance
-    return found
+            by_image[image] = covariance
+    return by_image
 
 
 def write_covariances(path: Path, results: Iterable[LocalizationResult]) -> None:
@@ -191,14 +191,14 @@ def read_refinement(
     by_image: dict[str, list[PoseRefinement]] = {}
     for image, step in read_records(path, _refinement_row):
         by_image.setdefault(image, []).append(step)
-    found = {}
+    refinements = {}
     for image, steps in by_image.items():
         ends = [*(step.cam_from_world for step in steps[1:]), refined.get(image)]
-        found[image] = tuple(
+        refinements[image] = tuple(
             replace(step, cam_from_world=end) if step.accepted and end is not None else step
             for step, end in zip(steps, ends, strict=True)
         )
-    return found
+    return refinements
 
 
 def write_refinement(path: Path, results: Iterable[LocalizationResult]) -> None:

@@ -423,21 +423,21 @@ def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, F
     """
     x, y, z = points.T
     u, v = x / z, y / z
-    zero, one, radius2 = np.zeros_like(u), np.ones_like(u), u * u + v * v
+    zeros, ones, radius2 = np.zeros_like(u), np.ones_like(u), u * u + v * v
     scale = math.exp(change[0])
     slope = scale * (1 + change[3:].sum() * radius2)
     at = np.stack([slope * u, slope * v], axis=1)
     pose_columns = slope[:, None, None] * np.stack(
         [
-            np.stack([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z], axis=1),
-            np.stack([-1 - v * v, u * v, u, zero, 1 / z, -v / z], axis=1),
+            np.stack([-u * v, 1 + u * u, -v, 1 / z, zeros, -u / z], axis=1),
+            np.stack([-1 - v * v, u * v, u, zeros, 1 / z, -v / z], axis=1),
         ],
         axis=1,
     )
     columns = [
         at,
-        np.stack([one, zero], axis=1),
-        np.stack([zero, one], axis=1),
+        np.stack([ones, zeros], axis=1),
+        np.stack([zeros, ones], axis=1),
         (scale * radius2)[:, None] * np.stack([u, v], axis=1),
     ]
     camera_columns = np.stack(columns[: len(change)], axis=2)

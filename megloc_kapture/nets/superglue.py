@@ -10,7 +10,7 @@ is in the log domain; after it no product overflows, and omitted terms are less 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -56,15 +56,6 @@ class SuperGlueNet(nn.Module):
         self, pairs: Sequence[tuple[ImageKeypoints, ImageKeypoints]], iterations: int
     ) -> list[torch.Tensor]:
         """Return log assignments float32 (N + 1, M + 1) of pairs with keypoints, dustbins last."""
-        return self.assignments(pairs, iterations, [len(self.gnn.layers)])[0]
-
-    def assignments(
-        self,
-        pairs: Sequence[tuple[ImageKeypoints, ImageKeypoints]],
-        iterations: int,
-        after: Collection[int],
-    ) -> list[list[torch.Tensor]]:
-        """Return the assignments after each of several numbers of layers, ascending."""
         images = [image for pair in pairs for image in pair]
         lengths = [len(image.scores) for image in images]
         device = self.bin_score.device.type
@@ -73,17 +64,9 @@ class SuperGlueNet(nn.Module):
             scores = torch.cat([image.scores for image in images])
             located = torch.column_stack([torch.cat([image.xy for image in images]), scores])
             tokens = torch.cat([image.descriptors for image in images]) + self.kenc.encoder(located)
-        assigned = [self._assigned(tokens, lengths, iterations)] if 0 in after else []
         for number, layer in enumerate(self.gnn.layers, start=1):
             tokens = tokens + layer(tokens, lengths, cross=number % 2 == 0)
-            if number in after:
-                assigned.append(self._assigned(tokens, lengths, iterations))
-        return assigned
-
-    def _assigned(
-        self, tokens: torch.Tensor, lengths: list[int], iterations: int
-    ) -> list[torch.Tensor]:
-        with torch.autocast(tokens.device.type, enabled=False):
+        with torch.autocast(device, enabled=False):
             sides = torch.split(self.final_proj(tokens), lengths)
             products = [
                 a @ b.T / self.descriptor_size**0.5

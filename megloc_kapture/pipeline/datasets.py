@@ -350,6 +350,8 @@ def _has_depth(root: Path) -> bool:
     data = KaptureFolder(root).read()
     has_depth = bool(depth_records(data))
     if data.records_depth and not has_depth:
-        said = "%s: no rig joins the depth sensors to cameras of their moments; depth is not used"
-        _log.warning(said, root)
+        message = (
+            "%s: no rig joins the depth sensors to cameras of their moments; depth is not used"
+        )
+        _log.warning(message, root)
     return has_depth

@@ -297,7 +297,7 @@ class Import(_RunStage):
         return {**self._run.source.settings(), PROTOCOL: self._protocol()}
 
     def plugins(self) -> Sequence[object]:
-        return [one for one in (self._run.source.adapter,) if one is not None]
+        return [adapter for adapter in (self._run.source.adapter,) if adapter is not None]
 
     def external(self) -> Mapping[str, str]:
         if self.root is None:

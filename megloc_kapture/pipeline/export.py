@@ -145,7 +145,7 @@ def _file_of(image: PosedImage, who: str) -> Path:
 
 def export_tum(scene: Scene, output: Path) -> None:
     rows = []
-    for image in sorted(scene.images, key=lambda one: one.timestamp):
+    for image in sorted(scene.images, key=lambda record: record.timestamp):
         world_from_cam = image.cam_from_world.inverse()
         w, *vector = world_from_cam.quat_wxyz
         numbers = (*world_from_cam.translation, *vector, w)

@@ -251,11 +251,11 @@ def plain_name(local_type: str) -> str:
 def _extractor_named(name: str) -> PluginChoice | None:
     """Return the plugin named by a type or its weights, ignoring a trailing number (r2d2_500)."""
     plugins = {plain_name(plugin): plugin for plugin in plugin_names(LOCAL_FEATURES)}
-    weights = {plain_name(one): one for one in registry()}
+    weights = {plain_name(key): key for key in registry()}
     for plain in (plain_name(name), plain_name(re.sub(r"[-_ ]\d+k?$", "", name))):
         if plain in plugins:
             return PluginChoice(name=plugins[plain])
-        plugin = next((plugins[one] for one in plugins if plain.startswith(one)), None)
+        plugin = next((plugins[key] for key in plugins if plain.startswith(key)), None)
         if plugin is not None and plain in weights:
             return PluginChoice(name=plugin, options={"weights": weights[plain]})
     return None

@@ -179,7 +179,7 @@ class LocalType:
             num_found={name: pair.num_found for name, pair in pairs.items()},
             name=image.query.name,
         )
-        skipped = next((one.skipped for one in retried.tried), "")
+        skipped = next((tried.skipped for tried in retried.tried), "")
         remark = f"guided pyramid matching: skipped {skipped}" if skipped else ""
         return np.concatenate([query.keypoints_px, retried.added_px]), retried.matches, remark
 

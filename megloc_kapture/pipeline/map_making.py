@@ -22,7 +22,6 @@ from typing import Any
 from megloc_kapture.datasets.colmap_map import (
     ColmapFolders,
     ColmapReconstruction,
-    OtherFeaturesError,
     find_colmap,
     is_colmap,
 )
@@ -316,10 +315,8 @@ def import_colmap(
         )
         read.write_images(output)
         return {"images": len(read.names), "points": 0}
-    try:
-        return read.write_map(output, work=work)
-    except OtherFeaturesError as error:
-        _log.warning("%s; its images are mapped again with its poses", error)
+    if (counts := read.write_map(output, work=work)) is not None:
+        return counts
     with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
         images = Path(scratch) / "images"
         read.write_images(images)
@@ -334,7 +331,7 @@ def import_colmap(
             made.rename(output / made.name)
     read.link_images(output)
     folder = KaptureFolder(output)
-    seen = sum(len(found) for found in folder.observations().values())
+    seen = sum(len(observed) for observed in folder.observations().values())
     return {"images": len(read.names), "points": len(folder.points3d()), "observations": seen}
 
 

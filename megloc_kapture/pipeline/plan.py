@@ -71,8 +71,8 @@ class Workspace:
         return read_manifest(self.manifest_path(stage))
 
     def manifest_paths(self) -> list[Path]:
-        found = (self.root / "stages").glob("*.json")
-        return sorted(path for path in found if path.name[0] != ".")
+        paths = (self.root / "stages").glob("*.json")
+        return sorted(path for path in paths if path.name[0] != ".")
 
     def partial_path(self, stage: str) -> Path:
         """Return the folder of a stage's unfinished output."""
@@ -338,14 +338,14 @@ def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[
     if not missing:
         return {}
     manifests = [m for path in workspace.manifest_paths() if (m := read_manifest(path)) is not None]
-    found = {}
+    outputs = {}
     for path in missing:
         made = [m for m in manifests if any(is_below(path, output) for output in m.outputs)]
         check_option(
             made, f"stage {stage.name} reads {path}, which no stage has written in {workspace.root}"
         )
-        found.update({manifest.stage: manifest.output for manifest in made})
-    return found
+        outputs.update({manifest.stage: manifest.output for manifest in made})
+    return outputs
 
 
 def _check_root(stage: Stage, workspace: Workspace) -> None:
@@ -362,11 +362,11 @@ def _check_root(stage: Stage, workspace: Workspace) -> None:
 
 
 def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
-    found = {first: "asked for"}
+    reasons = {first: "asked for"}
     for stage in stages:
-        if not found.keys().isdisjoint(_before(stages, stage)):
-            found[stage.name] = f"follows {first}"
-    return found
+        if not reasons.keys().isdisjoint(_before(stages, stage)):
+            reasons[stage.name] = f"follows {first}"
+    return reasons
 
 
 def _take_over(stage: Stage, workspace: Workspace) -> None:
@@ -380,10 +380,12 @@ def _take_over(stage: Stage, workspace: Workspace) -> None:
 
 def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
     if isinstance(old, Mapping) and isinstance(new, Mapping):
-        found: list[str] = []
+        differences: list[str] = []
         for key in sorted(set(old) | set(new)):
-            found += _differences(old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key)
-        return found
+            differences += _differences(
+                old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key
+            )
+        return differences
     return [] if old == new else [prefix]
 
 

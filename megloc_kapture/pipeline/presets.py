@@ -178,7 +178,7 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
 
 
 def _similar(path: str, root: type[Options]) -> str:
-    keys = [one.key for one in options_of(root())]
+    keys = [option.key for option in options_of(root())]
     elsewhere = [key for key in keys if key.endswith(f".{path.rpartition('.')[2]}")]
     steps = {key.rpartition(".")[0] for key in keys} - {""}
     similar = elsewhere or get_close_matches(path, [*keys, *steps], n=1)
@@ -228,11 +228,11 @@ def _merged_choices(
     ``local_features.aliked.options.max_keypoints``.
     """
     merged = [
-        {"name": one} if isinstance(one, str) else dict(one)
-        for one in choices
-        if isinstance(one, str | dict)
+        {"name": choice} if isinstance(choice, str) else dict(choice)
+        for choice in choices
+        if isinstance(choice, str | dict)
     ]
-    named = {one.get("name"): one for one in merged}
+    named = {choice.get("name"): choice for choice in merged}
     if set(changes) <= set(named):
         for name, change in changes.items():
             check_option(
@@ -264,8 +264,8 @@ def check_weights(options: PipelineOptions) -> None:
         preset = max(fetching, key=lambda name: len(fetching[name]))
         free = all(lookup(name).commercial for name in fetching[preset])
         command = f"megloc weights fetch --preset {preset}{'' if free else ' --accept-licence'}"
-        told = f"{error}\nthe weights of preset {preset} are fetched together by: {command}"
-        error = MissingWeightsError(told, names=error.names)
+        message = f"{error}\nthe weights of preset {preset} are fetched together by: {command}"
+        error = MissingWeightsError(message, names=error.names)
     raise error
 
 
@@ -274,15 +274,17 @@ def _missing(options: PipelineOptions) -> MissingWeightsError | None:
     matchers = [choice.matching or options.matching for choice in features]
     chosen: list[tuple[str, PluginChoice | None]] = [
         (SEGMENTERS, options.preprocessing.masks.segmenter),
-        *((LOCAL_FEATURES, one) for one in features),
-        *((MATCHERS, one) for one in matchers),
+        *((LOCAL_FEATURES, plugin) for plugin in features),
+        *((MATCHERS, plugin) for plugin in matchers),
         (POSE_RANKERS, options.localization.rank),
-        *((POSE_REFINERS, one) for one in options.pose_refinement.by),
+        *((POSE_REFINERS, plugin) for plugin in options.pose_refinement.by),
     ]
     makers: list[Callable[[], object]] = [
-        partial(load_plugin, group, one.name, one.options) for group, one in chosen if one
+        partial(load_plugin, group, plugin.name, plugin.options)
+        for group, plugin in chosen
+        if plugin
     ]
-    makers += [one.make for one in options.global_features if not one.is_vlad]
+    makers += [plugin.make for plugin in options.global_features if not plugin.is_vlad]
     missing = []
     for make in makers:
         try:

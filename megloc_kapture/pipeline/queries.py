@@ -146,8 +146,8 @@ class QueryImage:
         return pose
 
     def _own_mask(self) -> dict[str, NDArray[np.bool_]]:
-        own = self.query.read_mask()
-        return {} if own is None else {"own": own}
+        mask = self.query.read_mask()
+        return {} if mask is None else {"own": mask}
 
     @property
     def pixels(self) -> NDArray[np.uint8]:

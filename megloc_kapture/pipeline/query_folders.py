@@ -91,7 +91,7 @@ class Queries(ABC):
     def units(self, *, rigs: bool) -> list[scene.Unit]:
         """Return jointly localized (name, ``cam_from_rig``), by rig and timestamp or by image."""
         units = scene.query_units(self.data(), rigs=rigs)
-        usable = (tuple(one for one in unit if one[0] not in self.unreadable) for unit in units)
+        usable = (tuple(pair for pair in unit if pair[0] not in self.unreadable) for unit in units)
         return [unit for unit in usable if unit]
 
     def read(self, unit: scene.Unit) -> Unit:
@@ -208,13 +208,13 @@ class KaptureQueries(Queries):
             return self._map.to_colmap(self._data.camera_of(name))
         width, height = map(int, self._sensor(name).params[1:])
         try:
-            found = read_photo(self._folder.image_path(name)).camera
+            camera = read_photo(self._folder.image_path(name)).camera
         except DataError:  # the features are enough
             return guessed_camera(width, height)
         # keypoints are in pixels of the sensor's image size
-        is_other = min(width, height) > 0 and (width, height) != (found.width, found.height)
+        is_other = min(width, height) > 0 and (width, height) != (camera.width, camera.height)
         brings = any(name in local for local in self._local.values())
-        return scaled_camera(found, width, height) if is_other and brings else found
+        return scaled_camera(camera, width, height) if is_other and brings else camera
 
     def write_images(self, output: Path) -> None:
         link_images(self._folder.root, output)
@@ -229,10 +229,10 @@ class KaptureQueries(Queries):
             for local in self._local.values()
             if local.like.name in self._map.folder.types("descriptors")
         ]
-        for own, other in pairs:
+        for reader, other in pairs:
             require(
-                own.config.dsize == other.config.dsize,
-                f"{own.kind} of type {own.type_name!r} have {own.config.dsize} values, "
+                reader.config.dsize == other.config.dsize,
+                f"{reader.kind} of type {reader.type_name!r} have {reader.config.dsize} values, "
                 f"the map's {other.config.dsize}",
                 path=self._folder.root,
             )
@@ -251,7 +251,9 @@ class KaptureQueries(Queries):
         candidates: tuple[str, ...] | None = None
         try:
             features = self._features(name)
-            of_image = {t: one.read(name) for t, one in self._globals.items() if name in one}
+            of_image = {
+                t: reader.read(name) for t, reader in self._globals.items() if name in reader
+            }
         except DataError as error:
             self.faults[name] = str(error)
             features, of_image, candidates = self._no_features(), {}, ()
@@ -270,14 +272,14 @@ class KaptureQueries(Queries):
     @cached_property
     def _priors(self) -> dict[str, tuple[str, ...]]:
         images = self._map.images
-        found = {}
+        prior_of = {}
         for positions, permitted in self._map.restrictions.pools(self.names, images):
             prior = tuple(images[position] for position in permitted)
-            found.update(dict.fromkeys((self.names[at] for at in positions), prior))
-        return found
+            prior_of.update(dict.fromkeys((self.names[at] for at in positions), prior))
+        return prior_of
 
     def _features(self, name: str) -> dict[str, LocalFeatures]:
-        return {base: one.read(name) for base, one in self._local.items() if name in one}
+        return {base: reader.read(name) for base, reader in self._local.items() if name in reader}
 
     def _no_features(self) -> dict[str, LocalFeatures]:
         return {
@@ -360,8 +362,8 @@ class Photographs(Queries):
         """Describe images that are missing from the camera list."""
         lines = []
         if self.without_row:
-            said = f"{len(self.without_row)} images are not in the list of cameras"
-            lines.append(f"{said}, their cameras are estimated: {_first(self.without_row)}")
+            text = f"{len(self.without_row)} images are not in the list of cameras"
+            lines.append(f"{text}, their cameras are estimated: {_first(self.without_row)}")
         return lines
 
     def check(self) -> None:
@@ -372,7 +374,7 @@ class Photographs(Queries):
         return Query(image.camera, image.path, name, orientation=image.orientation)
 
     def gps(self) -> dict[str, tuple[float, float, float]]:
-        return {name: one.gps for name, one in self._images.items() if one.gps is not None}
+        return {name: image.gps for name, image in self._images.items() if image.gps is not None}
 
     def files(self) -> dict[str, Path]:
         return {name: self._images[name].path for name in self.names}
@@ -444,15 +446,15 @@ def _first(names: Sequence[str]) -> str:
 def _calibrated(root: Path) -> dict[str, Camera]:
     if not is_kapture(root):
         return {}
-    data, found = KaptureFolder(root).read(), {}
+    data, cameras = KaptureFolder(root).read(), {}
     for name in data.image_names():
         with suppress(DataError):
-            found[name] = data.camera_of(name)
-    return found
+            cameras[name] = data.camera_of(name)
+    return cameras
 
 
 def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
-    found: dict[str, Path] = {}
+    by_name: dict[str, Path] = {}
     for path in paths:
         if is_kapture(path):
             files = _images_of_kapture(KaptureFolder(path))
@@ -469,15 +471,15 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         else:
             raise DataError("no such file or folder", path=path)
         for name, file in files.items():
-            if name in found:
+            if name in by_name:
                 raise DataError(
-                    f"{found[name]} has the same name below the folder that was given; give the "
+                    f"{by_name[name]} has the same name below the folder that was given; give the "
                     "folder that holds both",
                     path=file,
                 )
             _check_name(name, file)
-            found[name] = file
-    return dict(sorted(found.items()))
+            by_name[name] = file
+    return dict(sorted(by_name.items()))
 
 
 def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
@@ -492,7 +494,7 @@ def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
 
 
 def _images_below(folder: Path) -> list[Path]:
-    found, seen = list[Path](), set[str]()
+    paths, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
         written = (here / MARKER).is_file() or (here / "sensors" / "sensors.txt").is_file()
@@ -503,9 +505,9 @@ def _images_below(folder: Path) -> list[Path]:
         # visit real folders first, so that links to them are the duplicates
         shown = (name for name in folders if not name.startswith("."))
         folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
-        found += [here / name for name in files if not name.startswith(".")]
+        paths += [here / name for name in files if not name.startswith(".")]
     named = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
-    return sorted(path for path in found if path.suffix.lower() in named or is_image(path))
+    return sorted(path for path in paths if path.suffix.lower() in named or is_image(path))
 
 
 def _check_name(name: str, path: Path) -> None:

@@ -68,12 +68,12 @@ class Results(Mapping[str, Pose | Failure]):
         self._stream = self._localized(workers, track)
 
     def __getitem__(self, name: str) -> Pose | Failure:
-        found = self._found[name]
-        while found is None:
+        outcome = self._found[name]
+        while outcome is None:
             other, result = next(self._stream)
             self._found[other] = result
-            found = self._found[name]
-        return found
+            outcome = self._found[name]
+        return outcome
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._found)
@@ -145,10 +145,10 @@ class Results(Mapping[str, Pose | Failure]):
             results = self.localizer.localize_units(units, executor, candidates=self._candidates)
             tracked = track(results, len(self._units), "localizing")
             if isinstance(self.queries, Photographs):
-                alone = [found for (found,) in tracked]
-                tracked = ([found] for found in self._with_shared_cameras(alone))
-            for unit, found in zip(self._units, tracked, strict=True):
-                for (name, _), result in zip(unit, found, strict=True):
+                alone = [outcome for (outcome,) in tracked]
+                tracked = ([outcome] for outcome in self._with_shared_cameras(alone))
+            for unit, outcomes in zip(self._units, tracked, strict=True):
+                for (name, _), result in zip(unit, outcomes, strict=True):
                     if isinstance(result, Failure) and name in self.queries.faults:
                         result = replace(result, reason=self.queries.faults[name])
                     yield name, result
@@ -162,10 +162,10 @@ class Results(Mapping[str, Pose | Failure]):
         for at, (((name, _),), result) in enumerate(zip(self._units, results, strict=True)):
             if isinstance(result, Pose):
                 of_sensor[data.record_of(name)[1]].append((at, result))
-        for found in of_sensor.values():
-            poses = [pose for _, pose in found]
+        for members in of_sensor.values():
+            poses = [pose for _, pose in members]
             solved = solve_with_shared_camera(poses, self.localizer.options.localization.pose)
-            for (at, _), pose in zip(found, solved, strict=True):
+            for (at, _), pose in zip(members, solved, strict=True):
                 results[at] = pose
         return results
 

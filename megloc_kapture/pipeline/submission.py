@@ -142,20 +142,20 @@ def write_submission(
 
 
 def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _Results:
-    own = KaptureFolder(localized).read()
-    data = own
+    localized_data = KaptureFolder(localized).read()
+    data = localized_data
     query = None if beside is None else beside / QUERY
     if query is not None and (query / "sensors" / "sensors.txt").is_file():
         # includes the rig, and queries missing from a foreign result
         data = KaptureFolder(query).read()
-        strange = set(own.image_names()) - set(data.image_names())
+        strange = set(localized_data.image_names()) - set(data.image_names())
         if strange:
             raise DataError(
                 f"image {min(strange)!r} is not among the queries of {query}: is the result of "
                 "this dataset?",
                 path=localized,
             )
-    path, poses = localized / STATUS_FILE, own.poses()
+    path, poses = localized / STATUS_FILE, localized_data.poses()
     statuses = read_status(path) if path.is_file() else {}
     results = {
         name: replace(statuses.get(name, LocalizationResult()), cam_from_world=poses.get(name))
@@ -202,9 +202,9 @@ def _ltvl(
     rule = rules.pose_file_names
     unnamed = [] if names else [i for i in posed if not is_name(name_by_rule(i, rule))]
     if unnamed:
-        said = "%d images have no row in the pose file, whose names hold no white space: %s%s"
+        message = "%d images have no row in the pose file, whose names hold no white space: %s%s"
         more = ", ..." if len(unnamed) > 1 else ""
-        _log.warning(said, len(unnamed), repr(unnamed[0]), more)
+        _log.warning(message, len(unnamed), repr(unnamed[0]), more)
         posed = sorted(set(posed) - set(unnamed))
     official = {image: world.pose_in_official(poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rule)
@@ -236,7 +236,7 @@ def _mlad(results: _Results, tables: Path) -> _Content:
             pose = relative_pose(query, reference, scale=scale)
         row = RelativePose(timestamp_of(pair.reference), timestamp_of(pair.query), pose)
         rows.setdefault(pair.file, []).append(row)
-    return {name: format_mlad_file(own) for name, own in rows.items()}, posed, missing
+    return {name: format_mlad_file(image_rows) for name, image_rows in rows.items()}, posed, missing
 
 
 def _dataset_fingerprint(workspace: Path | None) -> str | None:
@@ -250,12 +250,12 @@ def workspace_provenance(localized: Path) -> dict[str, Any]:
     made = _maker(localized, manifests)
     if made is None:
         return {}
-    found: dict[str, Any] = {"localization_fingerprint": made.fingerprint}
+    provenance: dict[str, Any] = {"localization_fingerprint": made.fingerprint}
     handed_in = manifests.get("submission")
     if handed_in is not None and handed_in.inputs.get(made.stage) == made.output:
         options = handed_in.options
-        found |= {key: options[key] for key in ("preset", "options") if key in options}
-    return found
+        provenance |= {key: options[key] for key in ("preset", "options") if key in options}
+    return provenance
 
 
 def _weights(localized: Path) -> dict[str, str]:
@@ -271,20 +271,20 @@ def _weights(localized: Path) -> dict[str, str]:
             before = manifests.get(stage)
             if before is not None and before.output == output and stage not in reached:
                 waiting.append(before)
-    weights = [one.options.get("weights") for one in reached.values()]
-    found = {file: sha for part in weights if isinstance(part, dict) for file, sha in part.items()}
-    return dict(sorted(found.items()))
+    weights = [step.options.get("weights") for step in reached.values()]
+    sha_of = {file: sha for part in weights if isinstance(part, dict) for file, sha in part.items()}
+    return dict(sorted(sha_of.items()))
 
 
 def _manifests(localized: Path) -> dict[str, Manifest]:
     paths = sorted((localized.resolve().parent / "stages").glob("*.json"))
-    found = map(read_manifest, paths)
-    return {manifest.stage: manifest for manifest in found if manifest is not None}
+    manifests = map(read_manifest, paths)
+    return {manifest.stage: manifest for manifest in manifests if manifest is not None}
 
 
 def _maker(localized: Path, manifests: Mapping[str, Manifest]) -> Manifest | None:
     name = localized.resolve().name
-    return next((one for one in manifests.values() if name in one.outputs), None)
+    return next((manifest for manifest in manifests.values() if name in manifest.outputs), None)
 
 
 FOLDER = "submissions"

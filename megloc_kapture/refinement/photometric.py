@@ -184,10 +184,10 @@ class NormalEquations:
 
     @classmethod
     def of(cls, sums: tuple[Float64, ...], cost: float, count: int) -> NormalEquations:
-        pose, mixed, own, pose_gradient, own_gradient = sums
+        pose, mixed, blocks, pose_gradient, own_gradient = sums
         pose = pose + pose.T
         pose[np.diag_indices(6)] *= 0.5  # the diagonal is in both halves
-        return cls(pose, mixed, own, pose_gradient, own_gradient, cost / max(count, 1), count)
+        return cls(pose, mixed, blocks, pose_gradient, own_gradient, cost / max(count, 1), count)
 
     def reduced(self, damping: float = 0.0) -> tuple[Float64, Float64, Float64] | None:
         # the ridge keeps the block of an invisible reference invertible
@@ -226,12 +226,12 @@ def empty_sums(num_groups: int, channels: int) -> tuple[Float64, ...]:
     return tuple(np.zeros(shape) for shape in (*shapes, (num_groups, channels, 2)))
 
 
-def _solve_pairs(own: Float64, right: Float64) -> tuple[Float64, Float64]:
+def _solve_pairs(blocks: Float64, right: Float64) -> tuple[Float64, Float64]:
     """Solve 2x2 systems (..., 3) for right sides (..., 2), with a ridge.
 
     Systems are stored as gain gain, gain bias, bias bias.
     """
-    first, cross, second = np.moveaxis(own, -1, 0)
+    first, cross, second = np.moveaxis(blocks, -1, 0)
     ridge = 1e-9 * (first + second) + 1e-12
     first, second = first + ridge, second + ridge
     determinant = first * second - cross * cross

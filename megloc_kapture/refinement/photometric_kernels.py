@@ -157,7 +157,7 @@ def normal_equations(rows, groups, squared_scale, sums):
     to: pose (6, 6), upper half; pose with gain and bias (G, C, 6, 2); gain gain, gain bias, bias
     bias (G, C, 3); gradients of the pose (6,) and of gain and bias (G, C, 2).
     """
-    pose, mixed, own, pose_gradient, own_gradient = sums
+    pose, mixed, blocks, pose_gradient, own_gradient = sums
     channels = rows.shape[1]
     cost = 0.0
     count = 0
@@ -176,9 +176,9 @@ def normal_equations(rows, groups, squared_scale, sums):
         for c in range(channels):
             residual = weight * rows[k, c, 0]
             value = rows[k, c, 7]
-            own[group, c, 0] += weight * value * value
-            own[group, c, 1] += weight * value
-            own[group, c, 2] += weight
+            blocks[group, c, 0] += weight * value * value
+            blocks[group, c, 1] += weight * value
+            blocks[group, c, 2] += weight
             own_gradient[group, c, 0] += residual * value
             own_gradient[group, c, 1] += residual
             for i in range(6):

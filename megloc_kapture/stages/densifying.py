@@ -110,13 +110,13 @@ def read_beside(
     path = side_file(root, image, kind)
     if not path.is_file():
         return None
-    found = np.load(path).astype(np.float32)
-    return np.asarray(found / np.float32(127) if kind == "normals" else found)
+    values = np.load(path).astype(np.float32)
+    return np.asarray(values / np.float32(127) if kind == "normals" else values)
 
 
 def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: int) -> KaptureData:
     """Add a depth sensor on a common rig to each camera whose images have depth."""
-    found = replace(
+    extended = replace(
         data,
         sensors=dict(data.sensors),
         rigs={rig: dict(members) for rig, members in data.rigs.items()},
@@ -126,19 +126,19 @@ def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: in
     for image in images:
         timestamp, camera = data.record_of(image)
         sensor = f"{camera}_mvs"
-        if sensor not in found.sensors:
+        if sensor not in extended.sensors:
             pinhole = stereo_camera(data.camera_of(image), max_size_px)
-            found.sensors[sensor] = Sensor.from_camera(pinhole, name=sensor, sensor_type="depth")
+            extended.sensors[sensor] = Sensor.from_camera(pinhole, name=sensor, sensor_type="depth")
             carriers = [rig for rig, members in data.rigs.items() if camera in members]
             for rig in carriers:
-                found.rigs[rig][sensor] = found.rigs[rig][camera]
+                extended.rigs[rig][sensor] = extended.rigs[rig][camera]
             if not carriers:
                 same = RigidTransform.identity()
-                found.rigs[f"{camera}_with_mvs"] = {camera: same, sensor: same}
-        if (own := data.trajectories.get((timestamp, camera))) is not None:
-            found.trajectories[timestamp, sensor] = own
-        found.records_depth[timestamp, sensor] = depth_path(image)
-    return found
+                extended.rigs[f"{camera}_with_mvs"] = {camera: same, sensor: same}
+        if (pose := data.trajectories.get((timestamp, camera))) is not None:
+            extended.trajectories[timestamp, sensor] = pose
+        extended.records_depth[timestamp, sensor] = depth_path(image)
+    return extended
 
 
 def link_images_and_masks(source: KaptureFolder, output: Path) -> None:
@@ -167,10 +167,13 @@ def write_points(
         row_of = {name: row for row, name in enumerate(names)}
         rows = np.array([row_of[name] for name in seen.image_names], np.int32)
         image_ids = [rows[seen.image_ids] if len(rows) else seen.image_ids]
-        image_ids += [np.full(len(own.xyz), row_of[image], np.int32) for image, own in new]
-        keypoint_ids = [own.keypoint_ids.astype(np.int32) for _, own in new]
-        xyz += [np.concatenate([own.xyz, np.zeros_like(own.xyz)], axis=1) for _, own in new]
-        uncertain += [own.covariances for _, own in new]
+        image_ids += [
+            np.full(len(of_image.xyz), row_of[image], np.int32) for image, of_image in new
+        ]
+        for _, of_image in new:
+            xyz.append(np.concatenate([of_image.xyz, np.zeros_like(of_image.xyz)], axis=1))
+            uncertain.append(of_image.covariances)
+        keypoint_ids = [of_image.keypoint_ids.astype(np.int32) for _, of_image in new]
         count = sum(map(len, keypoint_ids))
         observations[local_type] = Observations(
             local_type,
@@ -198,8 +201,8 @@ def fuse_depth(
     require(path.is_file(), "no densified map: reconstruction/depth.csv is missing", path=path)
     images = stereo_images(densified)
     jobs = [
-        (image, [other for other in own if other < image and other in images])
-        for image, own in images.items()
+        (image, [other for other in others if other < image and other in images])
+        for image, others in images.items()
     ]
     parts = work.map(partial(_points, FolderSpec(densified), agreement), jobs, "cloud")
     nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
@@ -329,9 +332,11 @@ def densify_map(
     rows = [replace(row, reason=failed.get(row.image, row.reason)) for row in rows]
     lifted: dict[str, dict[str, LiftedPoints]] = {}
     fills = {}
-    for job, (fill, found) in zip(done, work.map(_confirm, done, "agreement"), strict=True):
+    for job, (fill, points_of_type) in zip(
+        done, work.map(_confirm, done, "agreement"), strict=True
+    ):
         fills[job.image] = fill
-        for local_type, points in found.items():
+        for local_type, points in points_of_type.items():
             lifted.setdefault(local_type, {})[job.image] = points
     if jobs:
         remove(jobs[0].scratch)
@@ -432,21 +437,21 @@ def _plan(
         if not source.image_path(image).is_file():
             rows.append(replace(blank, reason="no image file"))
             continue
-        found = depth_range(poses[image].apply(xyz[points_of[row]])[:, 2])
+        limits = depth_range(poses[image].apply(xyz[points_of[row]])[:, 2])
         chosen = choose_sources(
             row, members[keys[row]], xyz, points_of, images_of, centers, fit.num_sources
         )
         sources = tuple(
             images[other] for other in chosen if source.image_path(images[other]).is_file()
         )
-        if found is None or not sources:
-            reason = "too few points in sight" if found is None else "no image shares points"
+        if limits is None or not sources:
+            reason = "too few points in sight" if limits is None else "no image shares points"
             rows.append(replace(blank, reason=reason))
             continue
         lifts = indices if options.mode == "points" else ()
         seen = {index.local_type: index.observed(image)[0] for index in lifts}
-        jobs.append(_Job(spec, scratch, output, image, sources, found, fit, estimator, seen))
-        rows.append(replace(blank, sources=sources, near_m=found[0], far_m=found[1]))
+        jobs.append(_Job(spec, scratch, output, image, sources, limits, fit, estimator, seen))
+        rows.append(replace(blank, sources=sources, near_m=limits[0], far_m=limits[1]))
     return jobs, rows
 
 
@@ -472,16 +477,16 @@ def _estimate(job: _Job) -> str:
     folder, size = job.folder.open(), job.fit.max_size_px
     try:
         views = [_view(folder, image, size) for image in (job.image, *job.sources)]
-        found = job.estimator.estimate(views[0], views[1:], job.range_m)
+        estimate = job.estimator.estimate(views[0], views[1:], job.range_m)
     except MeglocError as error:
         return str(error)
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
         return "out of memory; make mvs.max_size_px smaller"
-    write_array(_scratch(job, job.image, "depth"), found.depth_m)
-    write_array(_scratch(job, job.image, "sigma"), found.sigma_m)
-    write_array(_scratch(job, job.image, "normals"), found.normals)
+    write_array(_scratch(job, job.image, "depth"), estimate.depth_m)
+    write_array(_scratch(job, job.image, "sigma"), estimate.sigma_m)
+    write_array(_scratch(job, job.image, "normals"), estimate.normals)
     return ""
 
 

@@ -133,9 +133,9 @@ def _aggregate(
 @lru_cache(maxsize=1)
 def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladSettings]:
     """Read a vocabulary once per process, as it may be too large to send with every image."""
-    found = read_vocabulary(folder)
-    assert found is not None
-    return found
+    vocabulary = read_vocabulary(folder)
+    assert vocabulary is not None
+    return vocabulary
 
 
 def write_vocabulary(
@@ -246,8 +246,8 @@ def describe_images(
     many: Any = extractor
 
     def describe(batch: Sequence[NDArray[np.uint8]]) -> list[Any]:
-        found = many.describe_many(batch) if len(batch) > 1 else [extractor.describe(batch[0])]
-        return _checked(extractor, found, names[0])
+        vectors = many.describe_many(batch) if len(batch) > 1 else [extractor.describe(batch[0])]
+        return _checked(extractor, vectors, names[0])
 
     bounded = [bounded_image(image) for image in images]
     return np.stack(
@@ -261,9 +261,9 @@ def describe_images(
     )
 
 
-def _checked(extractor: GlobalFeatureExtractor, found: Any, label: str) -> list[NDArray[Any]]:
+def _checked(extractor: GlobalFeatureExtractor, described: Any, label: str) -> list[NDArray[Any]]:
     who = f"plugin {extractor.name!r} on image {label}"
-    vectors = [checked_array(who, vector, (None,), "float32") for vector in found]
+    vectors = [checked_array(who, vector, (None,), "float32") for vector in described]
     norms = np.array([np.linalg.norm(vector) for vector in vectors])
     if np.abs(norms - 1.0).max(initial=0) > 1e-3:
         raise PluginError(f"{who}: a vector of length {norms.max():.4g}, expected 1")
@@ -303,12 +303,12 @@ class ExtractGlobalFeatures(PipelineStage):
         return any(chosen.is_vlad for chosen in self.options.global_features)
 
     def settings(self) -> dict[str, Any]:
-        found = super().settings()
+        settings = super().settings()
         if self._trains():
-            return found
+            return settings
         # image networks do not depend on local features
         keys = ("global_features", "weights", "precision")
-        return {key: found[key] for key in keys if key in found}
+        return {key: settings[key] for key in keys if key in settings}
 
     def plugins(self) -> Sequence[object]:
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
@@ -321,9 +321,13 @@ class ExtractGlobalFeatures(PipelineStage):
                 vlad = chosen.vlad_options()
                 name = vlad.local_type or self.options.main_type()
                 folders = [mapping, *queries]
-                found = extract_vlad(mapping, folders, name, work.out, vlad.of_vlad(), work=work)
+                type_counts = extract_vlad(
+                    mapping, folders, name, work.out, vlad.of_vlad(), work=work
+                )
             else:
                 extractor = chosen.make(work.placement)
-                found = extract_global_features([mapping, *queries], extractor, work.out, work=work)
-            counts[f"images_with_{chosen.name}"] = found["images"]
+                type_counts = extract_global_features(
+                    [mapping, *queries], extractor, work.out, work=work
+                )
+            counts[f"images_with_{chosen.name}"] = type_counts["images"]
         return counts

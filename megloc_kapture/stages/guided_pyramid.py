@@ -129,15 +129,15 @@ def match_image_again(
         lambda image, mask: extract_all(method.extractor, [(image, mask)], [name])[0],
         like=itself,
     )
-    of_scale = [one for one in variants if one.variant.scale != 1.0]
-    found: list[list[VariantMatches]] = []
+    of_scale = [item for item in variants if item.variant.scale != 1.0]
+    matches: list[list[VariantMatches]] = []
     for names, used in ((others, variants), (only_scaled, of_scale)):
         for batch in batched(names, BATCH):
             loaded = [load(other) for other in batch]
             pairs = [f"pair {name}, {other}" for other in batch]
             match_with = partial(match_all, method.matcher, names=pairs)
-            found += match_variants(used, loaded, match_with, list(map(judge, batch, loaded)))
-    return found, _described(skipped)
+            matches += match_variants(used, loaded, match_with, list(map(judge, batch, loaded)))
+    return matches, _described(skipped)
 
 
 def _described(skipped: Mapping[ImageVariant, str]) -> str:
@@ -163,15 +163,15 @@ def _tried(pair: tuple[str, str], before: int, combined: Combined, skipped: str)
 
 def _sums(local_type: str, tried: Sequence[TriedPair]) -> dict[str, float]:
     """Warn of skipped variants, and return sums for the log."""
-    if skipped := Counter(one.skipped for one in tried if one.skipped):
-        said = "guided pyramid of %s: variants of %d pairs are skipped, most often %s"
-        _log.warning(said, local_type, skipped.total(), skipped.most_common(1)[0][0])
+    if skipped := Counter(pair.skipped for pair in tried if pair.skipped):
+        message = "guided pyramid of %s: variants of %d pairs are skipped, most often %s"
+        _log.warning(message, local_type, skipped.total(), skipped.most_common(1)[0][0])
     return {
         "pairs_tried": len(tried),
-        "pairs_gained": sum(one.after > one.before for one in tried),
-        "matches_before": sum(one.before for one in tried),
-        "matches_after": sum(one.after for one in tried),
-        "keypoints_added": sum(one.added for one in tried),
+        "pairs_gained": sum(pair.after > pair.before for pair in tried),
+        "matches_before": sum(pair.before for pair in tried),
+        "matches_after": sum(pair.after for pair in tried),
+        "keypoints_added": sum(pair.added for pair in tried),
     }
 
 
@@ -248,11 +248,11 @@ def retry_query(
     num_found : matches of each candidate before verification; by default as in ``matches``.
     """
     base = {other: pairs for other, pairs, _ in matches}
-    found = num_found or {}
+    num_of = num_found or {}
     hard = [
         other
         for other, pairs in base.items()
-        if method.options.is_hard(found.get(other, len(pairs)), len(pairs))
+        if method.options.is_hard(num_of.get(other, len(pairs)), len(pairs))
     ]
     mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
@@ -314,9 +314,9 @@ def pyramid_mapping(
     named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
     stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
     counts = {pair: len(stored.read(*pair)[0]) for pair in named}
-    found = num_found or {}
+    num_of = num_found or {}
     is_hard, mode = method.options.is_hard, method.options.mode
-    hard = [p for p in named if is_hard(found.get(p, counts[p]), counts[p]) and can_gain(*p)]
+    hard = [p for p in named if is_hard(num_of.get(p, counts[p]), counts[p]) and can_gain(*p)]
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
         others[a][0].append(b)
@@ -341,7 +341,7 @@ def pyramid_mapping(
             if pair in hard_pairs and mode != "off":
                 directed = matched_of[pair], matched_of[pair[::-1]]
                 variants = [
-                    (at, one) for at, (of_pair, _) in enumerate(directed) for one in of_pair
+                    (at, variant) for at, (of_pair, _) in enumerate(directed) for variant in of_pair
                 ]
                 for image in set(pair) - unions.keys():
                     unions[image] = KeypointUnion(keypoints.read(image))
@@ -417,14 +417,14 @@ def pyramid_queries(
     """
     before = num_found or {}
     larger = pyramid_type(local_type)
-    there = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
-    types = local_type, larger if there else local_type
+    has_larger = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
+    types = local_type, larger if has_larger else local_type
     candidates: dict[str, list[str]] = {}
     both = dict.fromkeys((pair.query, pair.map) for pair in pairs)
     for image, other in sorted(both, key=itemgetter(0)):
         candidates.setdefault(image, []).append(other)
     jobs = [
-        (image, others, {one: before[image, one] for one in others if (image, one) in before})
+        (image, others, {name: before[image, name] for name in others if (image, name) in before})
         for image, others in candidates.items()
     ]
     features = PyramidFeatures(output, query, local_type)
@@ -434,15 +434,15 @@ def pyramid_queries(
     extended = 0
     with MatchesWriter(output, larger, orphan=True) as writer:
         results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
-        for (image, *_), found in zip(jobs, results, strict=True):
-            for one in found.matches:
-                writer.write(image, *one)
-            features.write(image, found.added_px, found.added_descriptors)
-            tried += found.tried
-            extended += len(found.added_px) > 0
+        for (image, *_), result in zip(jobs, results, strict=True):
+            for matches in result.matches:
+                writer.write(image, *matches)
+            features.write(image, result.added_px, result.added_descriptors)
+            tried += result.tried
+            extended += len(result.added_px) > 0
     features.write_rest()
     return {
-        "images_extracted_again": len({one.pair[0] for one in tried}),
+        "images_extracted_again": len({pair.pair[0] for pair in tried}),
         "images_extended": extended,
         "pairs": sum(map(len, candidates.values())),
         **_sums(local_type, tried),

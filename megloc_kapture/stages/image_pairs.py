@@ -107,8 +107,8 @@ class Restrictions:
             if permitted is None:
                 yield positions, np.arange(len(images))
                 continue
-            found = [position for name in permitted for position in members.get(name, ())]
-            yield positions, np.unique(np.array(found, dtype=np.int64))
+            allowed = [position for name in permitted for position in members.get(name, ())]
+            yield positions, np.unique(np.array(allowed, dtype=np.int64))
 
     def _members(self, images: Sequence[str]) -> dict[str, list[int]]:
         members: dict[str, list[int]] = {}
@@ -156,13 +156,13 @@ class Retrieval:
         """
         search = FusedSearch(top_k, self.fusion, self.weights or None)
         asked = [as_blocks(source) for source in queries]
-        total, width = common_length(asked), sum(one.dimension for one in asked)
+        total, width = common_length(asked), sum(source.dimension for source in asked)
         step = max(1, _QUERY_ELEMENTS // max(width, 1))
-        found = []
+        blocks = []
         for start in range(0, total, step) or (0,):
             rows = [source.read(start, min(start + step, total)) for source in asked]
-            found.append(search.find(rows, database))
-        indices, scores = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+            blocks.append(search.find(rows, database))
+        indices, scores = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
         return indices, scores
 
 
@@ -251,7 +251,7 @@ def pair_map_images(
     point_ids, image_ids = np.zeros(0, np.int64), np.zeros(0, np.int64)
     if options.needs_points():
         point_ids, image_ids = _seen_points(covisible or mapping, images)
-    found, similarities = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
+    pairs_by_source, similarities = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
     for members in restrictions.frames(images):
         names = [images[member] for member in members]
         row_of = np.full(len(images), -1, dtype=np.int64)
@@ -275,9 +275,9 @@ def pair_map_images(
                 pairs = pairs_by_covisibility(len(names), *seen, options.covisibility)
             else:
                 pairs = exhaustive_pairs(len(names))
-            found.append(members[pairs])
+            pairs_by_source.append(members[pairs])
             similarities.append(np.full(len(pairs), -np.inf) if similarity is None else similarity)
-    return _united(images, np.concatenate(found), np.concatenate(similarities))
+    return _united(images, np.concatenate(pairs_by_source), np.concatenate(similarities))
 
 
 def _united(
@@ -423,17 +423,17 @@ class RerankingOptions(Options):
         if name is None or not self.reranks():
             return list(local_types)
         # a type may carry the name of its weights after the plugin's name
-        found = [one for one in local_types if base_type(one) == name]
-        return found or [one for one in local_types if one.startswith(name)]
+        types = [local_type for local_type in local_types if base_type(local_type) == name]
+        return types or [local_type for local_type in local_types if local_type.startswith(name)]
 
     def counted_types(self, local_types: Sequence[str]) -> list[str]:
-        found = self.types_named(local_types)
-        if not found:
+        types = self.types_named(local_types)
+        if not types:
             raise OptionError(
                 f"reranking.local_type: no local features of type {self.local_type!r}; "
                 f"{suggestion(str(self.local_type), map(base_type, local_types))}"
             )
-        return found
+        return types
 
 
 def rerank(
@@ -446,16 +446,21 @@ def rerank(
     """
     num = len(of_types[0]) if of_types else 0
     if options.by == "coverage":
-        rows = [[np.unique(np.asarray(matched)) for matched in own] for own in of_types]
+        rows = [[np.unique(np.asarray(matched)) for matched in type_rows] for type_rows in of_types]
         # keypoints are numbered consecutively across types
-        sizes = [max((int(ids[-1]) + 1 for ids in own if len(ids)), default=0) for own in rows]
+        sizes = [
+            max((int(ids[-1]) + 1 for ids in type_rows if len(ids)), default=0)
+            for type_rows in rows
+        ]
         starts = np.cumsum([0, *sizes[:-1]])
         keypoints = [
-            np.concatenate([start + own[at] for start, own in zip(starts, rows, strict=True)])
+            np.concatenate(
+                [start + type_rows[at] for start, type_rows in zip(starts, rows, strict=True)]
+            )
             for at in range(num)
         ]
         return greedy_coverage(keypoints, options.keep)
-    counts = [sum(int(own[at]) for own in of_types) for at in range(num)]
+    counts = [sum(int(type_rows[at]) for type_rows in of_types) for at in range(num)]
     order = list(range(num))
     if options.reranks():
         order = sorted(order, key=lambda at: (-counts[at], at))[: options.keep]
@@ -481,12 +486,12 @@ def reranked(
         return list(pairs)
     counted_types = options.counted_types(local_types)
     stored = [_stored(query, matches, name, options.by) for name in counted_types]
-    found = []
+    ranking = []
     for image, candidates in iterate_candidates(pairs):
         of_types = [[matched(image, other) for other in candidates] for matched in stored]
         for place, (at, count) in enumerate(zip(*rerank(of_types, options), strict=True)):
-            found.append(ImagePair(image, candidates[at], count + 1.0 / (2.0 + place)))
-    return found
+            ranking.append(ImagePair(image, candidates[at], count + 1.0 / (2.0 + place)))
+    return ranking
 
 
 def _stored(

@@ -129,10 +129,10 @@ def mask_path(folder: KaptureFolder, image: str) -> Path:
 
 def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: str) -> None:
     """Raise DataError if an image has different numbers of descriptors and keypoints."""
-    expected, found = keypoints.length(image), descriptors.length(image)
-    if found != expected:
+    expected, actual = keypoints.length(image), descriptors.length(image)
+    if actual != expected:
         raise DataError(
-            f"{found} descriptors for {expected} keypoints", path=descriptors.where(image)
+            f"{actual} descriptors for {expected} keypoints", path=descriptors.where(image)
         )
 
 
@@ -180,14 +180,14 @@ def extract_all(
     extractor: LocalFeatureExtractor, frames: Sequence[Frame], names: Sequence[str]
 ) -> list[LocalFeatures]:
     """Extract features from images of one size; very large ones are reduced for extraction."""
-    found = in_batches(
+    features = in_batches(
         extractor,
         "extract_many",
         partial(extract_bounded, extractor),
         frames,
         name=lambda k: f"image {names[k]}",
     )
-    return [_checked(extractor, *each) for each in zip(found, names, strict=True)]
+    return [_checked(extractor, *each) for each in zip(features, names, strict=True)]
 
 
 def _checked(extractor: LocalFeatureExtractor, features: Any, image: str) -> LocalFeatures:
@@ -217,8 +217,8 @@ class ExtractLocalFeatures(PipelineStage):
         counts: Counter[str] = Counter()
         for extractor in self.options.make_extractors():
             margin_px = self.options.mask_margin_px
-            found = extract_local_features(
+            type_counts = extract_local_features(
                 folders, extractor, work.out, mask_margin_px=margin_px, work=work
             )
-            counts.update(found)
+            counts.update(type_counts)
         return counts

@@ -137,10 +137,10 @@ def rows_at_their_places(
         return none, none
     tree = cKDTree(extracted)
     distance, nearest = tree.query(stored)
-    found = np.flatnonzero(distance <= max_shift_px)
-    near = tree.query_ball_point(extracted[nearest[found]], _SAME_PLACE_PX, return_sorted=True)
+    close = np.flatnonzero(distance <= max_shift_px)
+    near = tree.query_ball_point(extracted[nearest[close]], _SAME_PLACE_PX, return_sorted=True)
     lengths = [len(rows) for rows in near]
-    return np.repeat(found, lengths), np.concatenate([none, *near]).astype(np.int64)
+    return np.repeat(close, lengths), np.concatenate([none, *near]).astype(np.int64)
 
 
 _READ: dict[ArrayKind, Callable[[KaptureFolder, str], FeatureReader]] = {
@@ -176,16 +176,19 @@ def _copy_type(
     source: KaptureFolder, output: Path, kind: ArrayKind, type_name: str, *, link_own: bool
 ) -> None:
     copies = output / "reconstruction" / kind / type_name
-    reader, own = _READ[kind](source, type_name), source.root / "reconstruction"
+    reader, reconstruction = _READ[kind](source, type_name), source.root / "reconstruction"
     with FeatureWriter(output, kind, type_name, reader.config) as writer:
         for image in filter(reader.__contains__, source.read().image_names()):
             file = Path(reader.where(image))
-            if file.is_file() and (link_own or not file.is_relative_to(own)):
+            if file.is_file() and (link_own or not file.is_relative_to(reconstruction)):
                 hard_link(file, copies / f"{image}{SUFFIX[kind]}")
             else:  # user data, or a member of a tar
                 writer.write(image, reader.read(image))
     if kind == "global_features":
-        folders = [own / kind / type_name, *(d / kind / type_name for d in source.features_dirs)]
+        folders = [
+            reconstruction / kind / type_name,
+            *(d / kind / type_name for d in source.features_dirs),
+        ]
         for folder, name in product(folders, _VLAD_FILES):
             if (folder / name).is_file() and not (copies / name).exists():
                 hard_link(folder / name, copies / name)

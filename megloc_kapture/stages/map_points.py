@@ -72,18 +72,20 @@ def triangulate_map(
     by_type: dict[str, float] = {}
     for name, matched in of_type.items():
         reader, scratch = matches.matches(name), output.absolute()
-        found = _triangulated(mapping, reader, images, matched, options, num_threads, scratch)
+        triangulated = _triangulated(
+            mapping, reader, images, matched, options, num_threads, scratch
+        )
         observations[name] = Observations(
             keypoints_type=name,
             image_names=tuple(images),
-            point_ids=found.point_ids + len(xyz),
-            image_ids=found.image_ids.astype(np.int32),
-            keypoint_ids=found.keypoint_ids.astype(np.int32),
+            point_ids=triangulated.point_ids + len(xyz),
+            image_ids=triangulated.image_ids.astype(np.int32),
+            keypoint_ids=triangulated.keypoint_ids.astype(np.int32),
         )
-        xyz = np.concatenate([xyz, found.xyz])
-        errors_px = np.concatenate([errors_px, found.errors_px])
-        by_type[f"points_{name}"] = len(found.xyz)
-        by_type[f"observations_{name}"] = len(found.point_ids)
+        xyz = np.concatenate([xyz, triangulated.xyz])
+        errors_px = np.concatenate([errors_px, triangulated.errors_px])
+        by_type[f"points_{name}"] = len(triangulated.xyz)
+        by_type[f"observations_{name}"] = len(triangulated.point_ids)
     if not len(xyz):
         raise DataError(
             f"no point could be triangulated: {sum(map(len, of_type.values()))} of the image pairs "

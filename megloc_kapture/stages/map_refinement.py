@@ -350,9 +350,9 @@ def _votes_of_other_scans(
     scan_of = np.full(len(observed.cameras), -1)
     for number, scan in enumerate(scans):
         scan_of[list(scan.views)] = number
-    own = scan_of[observed.image_ids[lifted]]
-    order = np.argsort(own, kind="stable")
-    of_scan = np.split(order, np.searchsorted(own[order], np.arange(1, len(scans))))
+    own_scan = scan_of[observed.image_ids[lifted]]
+    order = np.argsort(own_scan, kind="stable")
+    of_scan = np.split(order, np.searchsorted(own_scan[order], np.arange(1, len(scans))))
     members: list[list[NDArray[np.int64]]] = [[] for _ in scans]
     for rows, scan in zip(of_scan, scans, strict=True):
         for other in scan.neighbours:

@@ -388,13 +388,13 @@ class FieldRefiner:
         known = np.isfinite(depth)
         in_cam = bearing_rays(rendering.camera, px[known]) * depth[known, None]
         options = AbsolutePoseOptions(max_error_px=_MAX_ERROR_PX)
-        found = absolute_pose(
+        solution = absolute_pose(
             query.keypoints_px[rows[known, 0], :2],
             pose.inverse().apply(in_cam),
             rendering.camera,
             options,
         )
-        return found.cam_from_world if found else found
+        return solution.cam_from_world if solution else solution
 
 
 def _checkers(shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -478,7 +478,8 @@ def localize_from_matches(
     jobs: list[_Job] = []
     for unit in units:
         images_of = [candidates.get(image, ()) for image, _ in unit]
-        jobs.append((unit, images_of, {one: restrictions.frame(one) for one in chain(*images_of)}))
+        frames = {candidate: restrictions.frame(candidate) for candidate in chain(*images_of)}
+        jobs.append((unit, images_of, frames))
     specs = FolderSpec(map_folder), FolderSpec(query), FolderSpec(matches)
     with shared_index(measured, scratch) as indices:
         localizer = _StoredQueries(*specs, indices, options, ranker)

@@ -284,14 +284,14 @@ def _option_text(options: Any, key: str) -> str:
     for name in key.split("."):
         value = getattr(value, name)
     several = value if isinstance(value, tuple) else () if value is None else (value,)
-    return " + ".join(str(getattr(one, "name", one)) for one in several) or "none"
+    return " + ".join(str(getattr(item, "name", item)) for item in several) or "none"
 
 
 def _selected(dump: Any, paths: Sequence[Sequence[str]]) -> Any:
     if not all(paths):
         return dump
     if isinstance(dump, list):
-        return [_selected(one, paths) for one in dump]
+        return [_selected(item, paths) for item in dump]
     keys = dict.fromkeys(path[0] for path in paths)
     return {
         key: _selected(dump[key], [path[1:] for path in paths if path[0] == key]) for key in keys

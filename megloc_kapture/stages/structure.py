@@ -190,8 +190,8 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
         first, second, metres = structure.distance
         for name in (first, second):
             require(name in model.poses, f"--scale: the map has no photograph {name!r}")
-        one, other = (model.poses[name].center() for name in (first, second))
-        apart = float(np.linalg.norm(one - other))
+        first_center, second_center = (model.poses[name].center() for name in (first, second))
+        apart = float(np.linalg.norm(first_center - second_center))
         require(apart != 0, f"--scale: {first} and {second} were taken at the same place")
         scale = metres / apart
         return World(unit=METRES), _moved(model, scale), {"metres_per_unit": scale}

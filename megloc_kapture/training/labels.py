@@ -12,43 +12,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
 from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
 from megloc_kapture.mapping.depth import MAX_DEPTH_JUMP, lift_keypoints, sample_depth
 from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 from megloc_kapture.plugins import DepthView
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 
 UNMATCHED, IGNORED = -1, -2
+# glue-factory's distances: matched keypoints are nearer in both images, unmatched ones are farther
+# from all keypoints of the other image
+POSITIVE_PX, NEGATIVE_PX = 3.0, 5.0
+# largest relative depth difference of a visible point
+_MAX_DEPTH_ERROR = 0.03
 # grid of pixels to measure overlap
 _GRID = (24, 18)
 
 Floats = NDArray[np.float64]
-
-
-class LabelOptions(Options):
-    """Options of labels, with glue-factory's distances."""
-
-    positive_px: float = Field(
-        default=3.0, gt=0, description="largest distance of matched keypoints, in both images"
-    )
-    negative_px: float = Field(
-        default=5.0,
-        gt=0,
-        description="smallest distance of an unmatched keypoint from all of the other image's",
-    )
-    max_depth_error: float = Field(
-        default=0.03,
-        gt=0,
-        description="largest relative depth difference of a visible point",
-    )
-
-    @model_validator(mode="after")
-    def _ordered(self) -> LabelOptions:
-        if self.negative_px < self.positive_px:
-            raise ValueError("negative_px is smaller than positive_px")
-        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,26 +58,22 @@ def labels_of_views(
     px_b: NDArray[np.floating[Any]],
     a: PosedView,
     b: PosedView,
-    options: LabelOptions | None = None,
 ) -> Labels:
     """Label keypoints (N, 2) and (M, 2) by depth and poses.
 
-    A keypoint without depth is unmatched if it is farther than ``negative_px`` (Sampson distance)
+    A keypoint without depth is unmatched if it is farther than NEGATIVE_PX (Sampson distance)
     from the epipolar curves of all keypoints without partner, else ignored.
     """
-    options = options or LabelOptions()
-    a_in_b, known_a, visible_a = reproject(px_a, a, b, options)
-    b_in_a, known_b, visible_b = reproject(px_b, b, a, options)
-    labels = _labels(
-        (px_a, a_in_b, known_a, visible_a), (px_b, b_in_a, known_b, visible_b), options
-    )
+    a_in_b, known_a, visible_a = reproject(px_a, a, b)
+    b_in_a, known_b, visible_b = reproject(px_b, b, a)
+    labels = _labels((px_a, a_in_b, known_a, visible_a), (px_b, b_in_a, known_b, visible_b))
     open_a, open_b = labels.partner_a == IGNORED, labels.partner_b == IGNORED
     lost_a, lost_b = open_a & ~known_a, open_b & ~known_b
     if lost_a.any() or lost_b.any():
         error = _epipolar_error_px(px_a[open_a], px_b[open_b], a, b)
         far_a, far_b = open_a.copy(), open_b.copy()
-        far_a[open_a] = error.min(axis=1, initial=np.inf) > options.negative_px
-        far_b[open_b] = error.min(axis=0, initial=np.inf) > options.negative_px
+        far_a[open_a] = error.min(axis=1, initial=np.inf) > NEGATIVE_PX
+        far_b[open_b] = error.min(axis=0, initial=np.inf) > NEGATIVE_PX
         labels.partner_a[lost_a & far_a] = UNMATCHED
         labels.partner_b[lost_b & far_b] = UNMATCHED
     return labels
@@ -109,7 +85,6 @@ def labels_of_homography(
     b_from_a: Floats,
     size_a: tuple[int, int],
     size_b: tuple[int, int],
-    options: LabelOptions | None = None,
 ) -> Labels:
     """Label keypoints by a homography (3, 3) between the pixels of two images of sizes (w, h)."""
 
@@ -121,17 +96,16 @@ def labels_of_homography(
 
     a_from_b = np.asarray(np.linalg.inv(b_from_a), np.float64)
     a, b = side(px_a, b_from_a, size_b), side(px_b, a_from_b, size_a)
-    return _labels(a, b, options or LabelOptions())
+    return _labels(a, b)
 
 
 def reproject(
-    px: NDArray[np.floating[Any]], a: PosedView, b: PosedView, options: LabelOptions | None = None
+    px: NDArray[np.floating[Any]], a: PosedView, b: PosedView
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Transform pixels (N, 2) of a into b by depth.
 
     Returns pixels (N, 2), NaN without depth, and masks (N,): with depth in a, and visible in b.
     """
-    options = options or LabelOptions()
     points, known = lift_keypoints(
         px, a.depth.depth_m, a.camera, a.depth.camera, a.depth.image_from_depth
     )
@@ -140,11 +114,11 @@ def reproject(
     in_depth = b.depth.image_from_depth.inverse().apply(in_b)
     measured = sample_depth(b.depth.depth_m, px_from_cam(b.depth.camera, in_depth), MAX_DEPTH_JUMP)
     with np.errstate(invalid="ignore"):
-        seen = np.abs(measured - in_depth[:, 2]) <= options.max_depth_error * in_depth[:, 2]
+        seen = np.abs(measured - in_depth[:, 2]) <= _MAX_DEPTH_ERROR * in_depth[:, 2]
     return px_in_b, known, known & seen & _inside(px_in_b, b.camera.width, b.camera.height)
 
 
-def overlap(a: PosedView, b: PosedView, options: LabelOptions | None = None) -> float:
+def overlap(a: PosedView, b: PosedView) -> float:
     """Return the share of pixels with depth visible in the other image, the smaller of two."""
     shares = []
     for view, other in ((a, b), (b, a)):
@@ -153,7 +127,7 @@ def overlap(a: PosedView, b: PosedView, options: LabelOptions | None = None) -> 
             *((np.arange(n) + 0.5) * side / n for n, side in zip(_GRID, size, strict=True))
         )
         grid = np.stack([x.ravel(), y.ravel()], axis=1)
-        _, known, visible = reproject(grid, view, other, options)
+        _, known, visible = reproject(grid, view, other)
         shares.append(visible.sum() / known.sum() if known.any() else 0.0)
     return float(min(shares))
 
@@ -161,7 +135,7 @@ def overlap(a: PosedView, b: PosedView, options: LabelOptions | None = None) -> 
 _Side = tuple[NDArray[np.floating[Any]], Floats, NDArray[np.bool_], NDArray[np.bool_]]
 
 
-def _labels(a: _Side, b: _Side, options: LabelOptions) -> Labels:
+def _labels(a: _Side, b: _Side) -> Labels:
     px_a, a_in_b, known_a, visible_a = a
     px_b, b_in_a, known_b, visible_b = b
     if not len(px_a) or not len(px_b):
@@ -170,12 +144,12 @@ def _labels(a: _Side, b: _Side, options: LabelOptions) -> Labels:
     both = np.where(visible_a[:, None] & visible_b, np.maximum(in_a, in_b), np.inf)
     nearest_a, nearest_b = both.argmin(axis=1), both.argmin(axis=0)
     rows = np.arange(len(px_a))
-    pairs = (nearest_b[nearest_a] == rows) & (both[rows, nearest_a] < options.positive_px)
+    pairs = (nearest_b[nearest_a] == rows) & (both[rows, nearest_a] < POSITIVE_PX)
     partner_a = np.where(pairs, nearest_a, IGNORED)
     partner_b = np.full(len(px_b), IGNORED)
     partner_b[nearest_a[pairs]] = rows[pairs]
-    partner_a[known_a & (in_b.min(axis=1) > options.negative_px)] = UNMATCHED
-    partner_b[known_b & (in_a.min(axis=0) > options.negative_px)] = UNMATCHED
+    partner_a[known_a & (in_b.min(axis=1) > NEGATIVE_PX)] = UNMATCHED
+    partner_b[known_b & (in_a.min(axis=0) > NEGATIVE_PX)] = UNMATCHED
     return Labels(partner_a, partner_b)
 
 

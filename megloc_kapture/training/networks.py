@@ -184,8 +184,7 @@ def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
 class PairModel(nn.Module):
     """A matcher and an optional descriptor network (None: frozen descriptors) as one module.
 
-    ``iterations``: of the optimal transport; ``deep_supervision``: mean loss over the head's
-    layers.
+    ``iterations`` are those of the optimal transport.
     """
 
     def __init__(
@@ -194,45 +193,35 @@ class PairModel(nn.Module):
         describer: SuperPointDescriber | XFeatDescriber | None,
         *,
         iterations: int,
-        deep_supervision: bool = False,
     ) -> None:
         super().__init__()
-        self.head, self.describer = head, describer
-        self._iterations, self._after = iterations, [0]
-        if isinstance(head, SuperGlueNet):
-            layers = len(head.gnn.layers)
-            self._after = list(range(2, layers, 2)) if deep_supervision else []
-            self._after.append(layers)
+        self.head, self.describer, self._iterations = head, describer, iterations
 
     def forward(self, pairs: Sequence[PreparedPair]) -> torch.Tensor:
         """Return the mean loss (), 0 without keypoints."""
         usable = [pair for pair in pairs if pair.usable]
+        if not usable:
+            return 0.0 * next(self.head.parameters()).sum()
         losses = [
             transport_loss(assignment, pair.labels)
-            for depth in self._assignments(usable)
-            for pair, assignment in zip(usable, depth, strict=True)
+            for pair, assignment in zip(usable, self._assignments(usable), strict=True)
         ]
-        if not losses:
-            return 0.0 * next(self.head.parameters()).sum()
-        return torch.stack(losses).sum() / (len(self._after) * len(pairs))
+        return torch.stack(losses).sum() / len(pairs)
 
     @torch.no_grad()
     def match(self, pair: PreparedPair) -> tuple[NDArray[np.int64], float]:
         """Return matches (K, 2) and the loss of a pair."""
         if not pair.usable:
             return np.zeros((0, 2), np.int64), 0.0
-        assignment = self._assignments([pair])[-1][0]
+        (assignment,) = self._assignments([pair])
         threshold = _CONFIDENT if isinstance(self.head, SuperGlueNet) else 0.0
         matches, _ = mutual_matches(assignment, threshold)
         return matches.cpu().numpy(), float(transport_loss(assignment, pair.labels))
 
-    def _assignments(self, pairs: Sequence[PreparedPair]) -> list[list[torch.Tensor]]:
+    def _assignments(self, pairs: Sequence[PreparedPair]) -> list[torch.Tensor]:
         sides = [(self._side(pair, 0), self._side(pair, 1)) for pair in pairs]
-        if not sides:
-            return []
-        if isinstance(self.head, SuperGlueNet):
-            return self.head.assignments(sides, self._iterations, self._after)
-        return [self.head(sides, self._iterations)]
+        assignments: list[torch.Tensor] = self.head(sides, self._iterations)
+        return assignments
 
     def _side(self, prepared: PreparedPair, side: int) -> ImageKeypoints:
         features = prepared.features[side]

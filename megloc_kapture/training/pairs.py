@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import is_image, read_depth_map, read_image_rgb
@@ -28,61 +27,27 @@ from megloc_kapture.preprocessing.frames import resized, scaled_camera
 from megloc_kapture.stages.scene import depth_records
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.training.labels import (
-    LabelOptions,
     Labels,
     PosedView,
     labels_of_homography,
     labels_of_views,
     overlap,
 )
-from megloc_kapture.values import Options, RigidTransform
+from megloc_kapture.values import RigidTransform
 
 # candidate pairs, before their overlap is measured
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
 _VIEWS_KEPT = 64
+# bounds of the overlap bins, from which pairs are drawn equally
+_OVERLAP_BINS = (0.1, 0.3, 0.5, 0.7)
+# views of a photograph: smallest size relative to it, largest rotation, and displacement of the
+# corners as a share of the view's sides
+_MIN_SCALE, _MAX_ANGLE_DEG, _PERSPECTIVE = 0.5, 45.0, 0.2
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Labelling = Callable[[NDArray[Any], NDArray[Any]], Labels]
 _HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-
-
-class HomographyOptions(Options):
-    min_scale: float = Field(
-        default=0.5, gt=0, le=1, description="smallest size of a view, relative to the photograph"
-    )
-    max_angle_deg: float = Field(
-        default=45.0, ge=0, le=180, description="largest rotation of a view"
-    )
-    perspective: float = Field(
-        default=0.2,
-        ge=0,
-        lt=0.5,
-        description="displacement of the corners, as a share of the view's sides",
-    )
-    light: float = Field(
-        default=1.0,
-        ge=0,
-        le=1,
-        description="strength of the changes of light, noise, blur and JPEG",
-    )
-
-
-class PairOptions(Options):
-    max_size_px: int = Field(default=640, ge=64, description="longer side of the reduced images")
-    overlap_bins: tuple[float, ...] = Field(
-        default=(0.1, 0.3, 0.5, 0.7),
-        description="bounds of the overlap bins, from which pairs are drawn equally",
-    )
-    homographies: HomographyOptions = HomographyOptions()
-    labels: LabelOptions = LabelOptions()
-
-    @field_validator("overlap_bins")
-    @classmethod
-    def _ascend(cls, bounds: tuple[float, ...]) -> tuple[float, ...]:
-        if len(bounds) < 2 or bounds[0] < 0 or any(a >= b for a, b in pairwise(bounds)):
-            raise ValueError("overlap_bins must be two or more ascending bounds")
-        return bounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +76,11 @@ class PosedPairs:
     def __init__(
         self,
         folder: KaptureFolder,
-        options: PairOptions,
+        max_size_px: int,
         work: Work = HERE,
         measured: Path | None = None,
     ) -> None:
-        self.folder, self._kapture, self._options = folder.root, folder, options
+        self.folder, self._kapture, self._max_size_px = folder.root, folder, max_size_px
         data = folder.read()
         poses, records = data.poses(), depth_records(data)
         self._poses, self._records = poses, records
@@ -138,14 +103,13 @@ class PosedPairs:
             scored = zip(named, overlaps, strict=True)
             write_pairs(measured, [ImagePair(*names, float(share)) for names, share in scored])
         self._bins = [
-            near[(overlaps >= low) & (overlaps < high)]
-            for low, high in pairwise(options.overlap_bins)
+            near[(overlaps >= low) & (overlaps < high)] for low, high in pairwise(_OVERLAP_BINS)
         ]
         self._bins = [pairs for pairs in self._bins if len(pairs)]
         if not self._bins:
             raise DataError(
-                f"no pair of images overlaps by {options.overlap_bins[0]:g} to "
-                f"{options.overlap_bins[-1]:g}; the {len(near)} candidate pairs overlap by "
+                f"no pair of images overlaps by {_OVERLAP_BINS[0]:g} to "
+                f"{_OVERLAP_BINS[-1]:g}; the {len(near)} candidate pairs overlap by "
                 f"{overlaps.min():.2f} to {overlaps.max():.2f}",
                 path=folder.root,
             )
@@ -159,7 +123,7 @@ class PosedPairs:
             for name, view in zip(names, (a, b), strict=True)
         ]
         keys = (str(self._kapture.image_path(names[0])), str(self._kapture.image_path(names[1])))
-        label = partial(labels_of_views, a=a, b=b, options=self._options.labels)
+        label = partial(labels_of_views, a=a, b=b)
         return TrainingPair((images[0], images[1]), keys, label, (a, b))
 
     def counts(self) -> dict[str, int]:
@@ -168,19 +132,17 @@ class PosedPairs:
     def _read_overlaps(self, path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         row_of = {name: row for row, name in enumerate(self._names)}
         pairs = read_pairs(path)
-        if not all(pair.query in row_of and pair.map in row_of for pair in pairs):
-            raise DataError(f"lists images that are not in {self.folder}", path=path)
         rows = [(row_of[pair.query], row_of[pair.map]) for pair in pairs]
         near = np.array(rows, np.int64).reshape(-1, 2)
         return near, np.array([pair.score for pair in pairs], np.float64)
 
     def _overlap(self, first: int, second: int) -> float:
         a, b = self._view(self._names[first]), self._view(self._names[second])
-        return overlap(a, b, self._options.labels)
+        return overlap(a, b)
 
     def _read_view(self, name: str) -> PosedView:
         camera, record = self._kapture.read().camera_of(name), self._records[name]
-        size = reduced_size(camera.width, camera.height, self._options.max_size_px)
+        size = reduced_size(camera.width, camera.height, self._max_size_px)
         path, sensor = self._kapture.depth_path(record.path), record.camera
         depth_m = read_depth_map(path, width=sensor.width, height=sensor.height)
         depth = DepthView(sensor, depth_m, record.image_from_depth)
@@ -190,8 +152,8 @@ class PosedPairs:
 class Photographs:
     """Pairs of views of single photographs: all image files below a folder."""
 
-    def __init__(self, folder: Path, options: PairOptions) -> None:
-        self.folder, self._options = Path(folder), options
+    def __init__(self, folder: Path, max_size_px: int) -> None:
+        self.folder, self._max_size_px = Path(folder), max_size_px
         if not self.folder.is_dir():
             raise DataError("no such folder", path=self.folder)
         self._paths = [path for path in sorted(self.folder.rglob("*")) if is_image(path)]
@@ -200,15 +162,11 @@ class Photographs:
 
     def draw(self, rng: np.random.Generator) -> TrainingPair:
         image = read_image_rgb(self._paths[rng.integers(len(self._paths))])
-        options = self._options.homographies
-        size = reduced_size(image.shape[1], image.shape[0], self._options.max_size_px)
-        (a, a_from_image), (b, b_from_image) = (
-            random_view(image, size, rng, options) for _ in range(2)
-        )
+        size = reduced_size(image.shape[1], image.shape[0], self._max_size_px)
+        (a, a_from_image), (b, b_from_image) = (random_view(image, size, rng) for _ in range(2))
         b_from_a = b_from_image @ np.linalg.inv(a_from_image)
-        lit = relit(a, rng, options.light), relit(b, rng, options.light)
         label = partial(labels_of_homography, b_from_a=b_from_a, size_a=size, size_b=size)
-        return TrainingPair(lit, None, partial(label, options=self._options.labels))
+        return TrainingPair((relit(a, rng), relit(b, rng)), None, label)
 
     def counts(self) -> dict[str, int]:
         return {"images": len(self._paths)}
@@ -228,7 +186,7 @@ def _size(view: PosedView) -> tuple[int, int]:
 
 
 def random_view(
-    image: Image, size: tuple[int, int], rng: np.random.Generator, options: HomographyOptions
+    image: Image, size: tuple[int, int], rng: np.random.Generator
 ) -> tuple[Image, Floats]:
     """Warp a random quadrilateral inside a photograph to a view of a size (w, h).
 
@@ -238,13 +196,13 @@ def random_view(
     width, height = size
     sides = np.array([image.shape[1], image.shape[0]], np.float64)
     rectangle = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64) * size
-    perturbed = rectangle + rng.uniform(-1, 1, (4, 2)) * options.perspective * np.array(size)
-    angle = np.radians(rng.uniform(-1, 1) * options.max_angle_deg)
+    perturbed = rectangle + rng.uniform(-1, 1, (4, 2)) * _PERSPECTIVE * np.array(size)
+    angle = np.radians(rng.uniform(-1, 1) * _MAX_ANGLE_DEG)
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     corners = (perturbed - rectangle.mean(axis=0)) @ rotation.T
     extent = np.ptp(corners, axis=0)
     # the largest part of the photograph that fits, times the scale
-    corners *= rng.uniform(options.min_scale, 1.0) * (sides / extent).min()
+    corners *= rng.uniform(_MIN_SCALE, 1.0) * (sides / extent).min()
     corners -= corners.min(axis=0)
     corners += rng.uniform(0, 1, 2) * (sides - corners.max(axis=0))
     view_from_image = cv2.getPerspectiveTransform(
@@ -258,13 +216,11 @@ def random_view(
     return np.asarray(view, np.uint8), np.asarray(view_from_image, np.float64)
 
 
-def relit(image: Image, rng: np.random.Generator, strength: float = 1.0) -> Image:
+def relit(image: Image, rng: np.random.Generator) -> Image:
     """Change gamma, exposure, cast, noise, blur and JPEG at random."""
-    if strength <= 0:
-        return image
-    gamma, exposure = np.exp2(rng.uniform(-1, 1, 2) * strength)
-    cast = np.exp2(rng.normal(0, 0.12 * strength, 3))
-    noise, blur = rng.uniform(0, 0.04 * strength), rng.uniform(0, 1.2 * strength)
+    gamma, exposure = np.exp2(rng.uniform(-1, 1, 2))
+    cast = np.exp2(rng.normal(0, 0.12, 3))
+    noise, blur = rng.uniform(0, 0.04), rng.uniform(0, 1.2)
     level = (image.astype(np.float32) / 255) ** np.float32(gamma)
     # values above white are lost, so exposure is mostly reduced
     level *= (min(exposure, 1.3) * cast).astype(np.float32)
@@ -272,6 +228,6 @@ def relit(image: Image, rng: np.random.Generator, strength: float = 1.0) -> Imag
         level = np.asarray(cv2.GaussianBlur(level, (0, 0), float(blur)), np.float32)
     level += rng.normal(0, noise, level.shape).astype(np.float32)
     lit = np.clip(255 * level, 0, 255).astype(np.uint8)
-    quality = int(rng.integers(100 - int(60 * strength), 101))
+    quality = int(rng.integers(40, 101))
     encodes, encoded = cv2.imencode(".jpg", lit, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8) if encodes else lit

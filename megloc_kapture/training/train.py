@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -46,7 +46,7 @@ from megloc_kapture.training.networks import (
     encoder_sizes,
     held_out_result,
 )
-from megloc_kapture.training.pairs import PairOptions, PairSource, Photographs, PosedPairs
+from megloc_kapture.training.pairs import PairSource, Photographs, PosedPairs
 
 COLUMNS = (
     *("step", "learning_rate", "loss", "held_out_loss", "precision", "recall"),
@@ -64,7 +64,7 @@ class TrainingOptions(NetworkOptions):
     )
     features: PluginChoice = PluginChoice(name="superpoint")
     max_keypoints: int = Field(default=512, gt=0, description="number of best keypoints per image")
-    pairs: PairOptions = PairOptions()
+    max_size_px: int = Field(default=640, ge=64, description="longer side of the reduced images")
     steps: int = Field(default=100_000, gt=0)
     pairs_per_step: int = Field(default=16, gt=0, description="number of pairs per batch")
     learning_rate: float = Field(
@@ -75,9 +75,6 @@ class TrainingOptions(NetworkOptions):
         gt=0,
         multiple_of=2,
         description="number of attention layers, alternating self and cross",
-    )
-    deep_supervision: bool = Field(
-        default=False, description="average the loss over all cross-attention layers"
     )
     sinkhorn_iterations: int = Field(default=50, gt=0, description="in training and evaluation")
     matcher_weights: str | None = Field(
@@ -101,21 +98,6 @@ class DescriptorOptions(TrainingOptions):
     )
 
 
-@dataclass
-class TrainingState:
-    step: int
-    rows: list[list[float]]  # curves so far, by COLUMNS; NaN if nothing is held out
-
-    @classmethod
-    def resume(
-        cls, path: Path, model: PairModel, optimizer: torch.optim.Optimizer
-    ) -> TrainingState:
-        if not path.is_file():
-            return cls(0, [])
-        content = load_state(read_content(path), path, model, optimizer)
-        return cls(content["step"], [list(map(float, row)) for row in content["rows"]])
-
-
 def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
     # plugins may not have descriptor_size
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
@@ -137,13 +119,16 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
                 f"{head.descriptor_size} dimensions; {options.features.name} has {size}"
             )
         describer = describer_of(extractor) if isinstance(options, DescriptorOptions) else None
-        iterations, deep = options.sinkhorn_iterations, options.deep_supervision
-        return PairModel(head, describer, iterations=iterations, deep_supervision=deep)
+        return PairModel(head, describer, iterations=options.sinkhorn_iterations)
 
 
 class Trainer:
+    """A seeded training; ``rows`` are the curves up to ``step``, by COLUMNS, NaN if unknown."""
+
     def __init__(self, options: TrainingOptions) -> None:
         self.options = options
+        self.step = 0
+        self.rows: list[list[float]] = []
         choice = options.features
         self.extractor = load_plugin(LOCAL_FEATURES, choice.name, choice.options)
         self._frozen = FrozenFeatures(self.extractor, options.max_keypoints)
@@ -155,17 +140,17 @@ class Trainer:
         # last evaluation by held-out source
         self.results: dict[str, HeldOutResult] = {}
 
+    def resume(self, path: Path) -> None:
+        """Continue from a state file."""
+        content = load_state(read_content(path), path, self.model, self.optimizer)
+        self.step, self.rows = content["step"], [list(map(float, row)) for row in content["rows"]]
+
     def train(
-        self,
-        sources: Sequence[PairSource],
-        state: TrainingState,
-        work: Work = HERE,
-        *,
-        threads: int = 1,
-    ) -> Iterator[TrainingState]:
-        """Train on pairs drawn evenly from the sources; yield at evaluations."""
+        self, sources: Sequence[PairSource], work: Work = HERE, *, threads: int = 1
+    ) -> Iterator[int]:
+        """Train on pairs drawn evenly from the sources; yield the step at evaluations."""
         options, losses = self.options, []
-        steps = range(state.step, options.steps)
+        steps = range(self.step, options.steps)
         threaded = ThreadPoolExecutor(threads) if threads > 1 else nullcontext()
         # set for all threads: feature extraction in a thread would toggle it during a step
         with without_tf32(self._device), threaded as pool:
@@ -178,9 +163,9 @@ class Trainer:
                 if (step + 1) % options.check_every and step + 1 < options.steps:
                     continue
                 row = [float(step + 1), self._rate(step), float(np.mean(losses))]
-                state = TrainingState(step + 1, [*state.rows, [*row, *self.evaluate()]])
-                losses = []
-                yield state
+                self.step, losses = step + 1, []
+                self.rows.append([*row, *self.evaluate()])
+                yield self.step
 
     def hold_out(self, sources: Mapping[str, PairSource]) -> None:
         """Draw the evaluation pairs of each source."""
@@ -242,29 +227,13 @@ TASKS: dict[str, type[TrainingOptions]] = {
 }
 
 
-@dataclass(frozen=True)
-class TrainingData:
-    kaptures: Sequence[KaptureFolder] = ()  # with poses and depth
-    photographs: Sequence[Path] = ()  # folders of images, for homographies
-    # for evaluation only, disjoint from ``kaptures``
-    held_out: Sequence[KaptureFolder] = ()
-
-    def check(self) -> None:
-        trained = [folder.root for folder in self.kaptures]
-        if not (trained or self.photographs):
-            raise OptionError("nothing to train on: give a kapture with depth, or photographs")
-        both = {path.resolve() for path in trained} & {f.root.resolve() for f in self.held_out}
-        if both:
-            raise OptionError(f"{min(both)}: is used for training and held out")
-        if len({folder.root.name for folder in self.held_out}) < len(self.held_out):
-            raise OptionError("held-out folders need different names")
-
-
 def train(
     options: TrainingOptions,
-    data: TrainingData,
     output: Path,
     *,
+    kaptures: Sequence[KaptureFolder] = (),
+    photographs: Sequence[Path] = (),
+    held_out: Sequence[KaptureFolder] = (),
     force: bool = False,
     threads: int = 1,
     work: Work = HERE,
@@ -273,81 +242,96 @@ def train(
 
     Each evaluation writes ``output`` (``X.safetensors``), for descriptors trained through SuperGlue
     also ``X-superglue.safetensors``, the manifest ``X.json``, the curves ``X.csv`` and
-    ``X.state.pt``, from which the same call resumes; ``X.overlaps`` is written before. ``force``
-    replaces another training's files; ``threads`` prepare pairs. Returns the last row of the
-    curves.
+    ``X.state.pt``, from which the same call resumes; ``X.overlaps`` is written before. Returns the
+    last row of the curves.
+
+    Parameters
+    ----------
+    kaptures, held_out : with poses and depth; ``held_out`` for evaluation only.
+    photographs : folders of images, for homographies.
+    force : replace another training's files.
+    threads : prepare pairs.
     """
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
-    data.check()
-    files, trainer = _Files(output), Trainer(options)
-    resumes = not force and (output.exists() or files.manifest.exists())
+    _check_data(kaptures, photographs, held_out)
+    trainer, manifest = Trainer(options), output.with_suffix(".json")
+    state, overlaps = output.with_suffix(".state.pt"), output.with_suffix(".overlaps")
+    resumes = not force and (output.exists() or manifest.exists())
     if not resumes:
-        files.begin()
+        remove(state)
+        remove(overlaps)
     posed = [
-        PosedPairs(folder, options.pairs, work, files.overlaps / f"{number:03d}.txt")
-        for number, folder in enumerate([*data.kaptures, *data.held_out])
+        PosedPairs(folder, options.max_size_px, work, overlaps / f"{number:03d}.txt")
+        for number, folder in enumerate([*kaptures, *held_out])
     ]
-    sources: list[PairSource] = [*posed[: len(data.kaptures)]]
-    sources += [Photographs(folder, options.pairs) for folder in data.photographs]
-    held_out = {source.folder.name: source for source in posed[len(data.kaptures) :]}
+    sources: list[PairSource] = [*posed[: len(kaptures)]]
+    sources += [Photographs(folder, options.max_size_px) for folder in photographs]
+    evaluated = {source.folder.name: source for source in posed[len(kaptures) :]}
     record = {
         "task": next(name for name, kind in TASKS.items() if kind is type(options)),
         "options": json.loads(options.model_dump_json()),
         "weights": getattr(trainer.extractor, "weights", dict)(),
         "data": {source.folder.name: source.counts() for source in sources},
-        "held_out_data": {name: source.counts() for name, source in held_out.items()},
+        "held_out_data": {name: source.counts() for name, source in evaluated.items()},
     }
     if resumes:
-        files.check(record)
-    state = TrainingState.resume(files.state, trainer.model, trainer.optimizer)
-    if state.step < options.steps:
-        trainer.hold_out(held_out)
-    for reached in trainer.train(sources, state, work, threads=threads):
-        state = reached
-        files.write(trainer, state, record)
-    return dict(zip(COLUMNS, state.rows[-1], strict=True)) if state.rows else {}
+        _check_same_training(output, record)
+    if state.is_file():
+        trainer.resume(state)
+    if trainer.step < options.steps:
+        trainer.hold_out(evaluated)
+    for _ in trainer.train(sources, work, threads=threads):
+        _write(trainer, output, record)
+    return dict(zip(COLUMNS, trainer.rows[-1], strict=True)) if trainer.rows else {}
 
 
-class _Files:
-    def __init__(self, output: Path) -> None:
-        self.output = output
-        self.state, self.manifest = output.with_suffix(".state.pt"), output.with_suffix(".json")
-        self.overlaps = output.with_suffix(".overlaps")
+def _check_data(
+    kaptures: Sequence[KaptureFolder],
+    photographs: Sequence[Path],
+    held_out: Sequence[KaptureFolder],
+) -> None:
+    if not (kaptures or photographs):
+        raise OptionError("nothing to train on: give a kapture with depth, or photographs")
+    trained, evaluated = ({f.root.resolve() for f in folders} for folders in (kaptures, held_out))
+    if both := trained & evaluated:
+        raise OptionError(f"{min(both)}: is used for training and held out")
+    if len({folder.root.name for folder in held_out}) < len(held_out):
+        raise OptionError("held-out folders need different names")
 
-    def begin(self) -> None:
-        remove(self.state)
-        remove(self.overlaps)
 
-    def check(self, record: Mapping[str, Any]) -> None:
-        """Raise OutputError unless the files are of the same training."""
-        try:
-            known = json.loads(read_content(self.manifest)).get("training")
-        except (DataError, ValueError, AttributeError):
-            known = None
-        if known is None:
-            raise OutputError(f"{self.output}: was not written by a training; -f replaces it")
-        if known != record:
-            changed = sorted(k for k in {*known, *record} if known.get(k) != record.get(k))
-            raise OutputError(
-                f"{self.manifest}: is from another training ({', '.join(changed)}); -f starts over"
-            )
+def _check_same_training(output: Path, record: Mapping[str, Any]) -> None:
+    """Raise OutputError unless the files are of the same training."""
+    manifest = output.with_suffix(".json")
+    try:
+        known = json.loads(read_content(manifest)).get("training")
+    except (DataError, ValueError, AttributeError):
+        known = None
+    if known is None:
+        raise OutputError(f"{output}: was not written by a training; -f replaces it")
+    if known != record:
+        changed = sorted(k for k in {*known, *record} if known.get(k) != record.get(k))
+        raise OutputError(
+            f"{manifest}: is from another training ({', '.join(changed)}); -f starts over"
+        )
 
-    def write(self, trainer: Trainer, state: TrainingState, record: Mapping[str, Any]) -> None:
-        model = trainer.model
-        networks: dict[Path, torch.nn.Module] = {}
-        if model.describer is not None:
-            networks[self.output] = model.describer.net
-        if isinstance(model.head, SuperGlueNet):
-            matcher = self.output.with_name(f"{self.output.stem}-superglue.safetensors")
-            networks[matcher if networks else self.output] = model.head
-        for path, network in networks.items():
-            tensors = {key: value.cpu().contiguous() for key, value in network.state_dict().items()}
-            write_bytes(path, save(tensors))
-        rows = [["" if v != v else f"{v:.6g}" for v in row] for row in state.rows]
-        write_csv_table(self.output.with_suffix(".csv"), COLUMNS, rows)
-        results = {name: asdict(result) for name, result in trainer.results.items()}
-        write_json(self.manifest, {"training": record, "step": state.step, "held_out": results})
-        # last: a state means that the other files are complete
-        more = {"step": state.step, "rows": state.rows}
-        write_bytes(self.state, state_bytes(model, trainer.optimizer, more))
+
+def _write(trainer: Trainer, output: Path, record: Mapping[str, Any]) -> None:
+    model = trainer.model
+    networks: dict[Path, torch.nn.Module] = {}
+    if model.describer is not None:
+        networks[output] = model.describer.net
+    if isinstance(model.head, SuperGlueNet):
+        matcher = output.with_name(f"{output.stem}-superglue.safetensors")
+        networks[matcher if networks else output] = model.head
+    for path, network in networks.items():
+        tensors = {key: value.cpu().contiguous() for key, value in network.state_dict().items()}
+        write_bytes(path, save(tensors))
+    rows = [["" if v != v else f"{v:.6g}" for v in row] for row in trainer.rows]
+    write_csv_table(output.with_suffix(".csv"), COLUMNS, rows)
+    results = {name: asdict(result) for name, result in trainer.results.items()}
+    manifest = {"training": record, "step": trainer.step, "held_out": results}
+    write_json(output.with_suffix(".json"), manifest)
+    # last: a state means that the other files are complete
+    progress = {"step": trainer.step, "rows": trainer.rows}
+    write_bytes(output.with_suffix(".state.pt"), state_bytes(model, trainer.optimizer, progress))

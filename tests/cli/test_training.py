@@ -24,7 +24,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.refinement import field_training
 from megloc_kapture.stages.scene import depth_records
 
-SMALL = ("steps=2", "layers=2", "pairs_per_step=1", "max_keypoints=40", "pairs.max_size_px=200")
+SMALL = ("steps=2", "layers=2", "pairs_per_step=1", "max_keypoints=40", "max_size_px=200")
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.datasets.megadepth import (
-    MegaDepthOptions,
     import_megadepth,
 )
 from megloc_kapture.errors import DataError
@@ -121,28 +120,24 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
     script = tmp_path / "plain_arrays.py"
     script.write_text(lines.replace("TABLE", repr(str(table))))
     subprocess.run([sys.executable, script], check=True)
-    counts = import_megadepth(root, tmp_path / "out", MegaDepthOptions(scenes=("0015",)))
+    counts = import_megadepth(root, tmp_path / "out", ("0015",))
     assert counts == {"scenes": 1, "images": 4, "without_depth": 1}
     check(tmp_path / "out" / "0015")
     found = dict(np.load(table))
-    for changes, message in (
-        ({"poses": found["poses"][:2]}, r"poses is float64 \(2, 4, 4\), expected \(5, 4, 4\)"),
-        ({"image_paths": np.array(["../../x.jpg"] * 5)}, "x.jpg"),
-    ):
-        np.savez(table, **{**found, **changes})
-        with pytest.raises(DataError, match=message):
-            import_megadepth(root, tmp_path / "broken")
+    np.savez(table, **{**found, "image_paths": np.array(["../../x.jpg"] * 5)})
+    with pytest.raises(DataError, match="x.jpg"):
+        import_megadepth(root, tmp_path / "broken")
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither Undistorted_SfM/SCENE nor scene_info/SCENE.npz"):
         import_megadepth(tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match=r"neither .*0001 nor .*0001\.npz exists"):
-        import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("0001",)))
+        import_megadepth(tmp_path, tmp_path / "out", ("0001",))
     (tmp_path / "empty" / "scene_info").mkdir(parents=True)
     arrays = {"intrinsics": np.eye(3)[None], "poses": np.eye(4)[None]}
     np.savez(tmp_path / "empty" / "scene_info" / "7.npz", image_paths=["x.jpg"], **arrays)
     with pytest.raises(DataError, match="scene 7 has no image with depth"):
         import_megadepth(tmp_path / "empty", tmp_path / "out")
     with pytest.raises(DataError, match="'..'"):
-        import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("..",)))
+        import_megadepth(tmp_path, tmp_path / "out", ("..",))

@@ -1,16 +1,159 @@
-"""Evaluation of poses in memory with conditions, statuses and confidences as mappings."""
+"""Worlds of known poses, their evaluation in memory, and pages that are checked."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from megloc_kapture.evaluation import scoring
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.io.dataset_tables import ImageGroup, Protocol
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
+
+VOID_ELEMENTS = {"meta", "br", "img"}
+
+
+@dataclass
+class World:
+    """Truth, estimates with known errors, conditions and statuses of some queries."""
+
+    truth: dict[str, RigidTransform] = field(default_factory=dict)
+    estimated: dict[str, RigidTransform] = field(default_factory=dict)
+    conditions: dict[str, str] = field(default_factory=dict)
+    statuses: dict[str, LocalizationResult] = field(default_factory=dict)
+    mapped: dict[str, RigidTransform] = field(default_factory=dict)
+
+
+def upright_camera(center: np.ndarray, heading_rad: float) -> RigidTransform:
+    """``cam_from_world`` of a level camera in a world whose z points up."""
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    # rows are the camera's right, down and forward in the world
+    rotation = np.array([[s, -c, 0.0], [0.0, 0.0, -1.0], [c, s, 0.0]])
+    return RigidTransform.from_matrix(rotation, -rotation @ center)
+
+
+def displaced(pose: RigidTransform, shift_m: np.ndarray, angle_deg: float) -> RigidTransform:
+    """The camera moved by ``shift_m`` in the world and turned by ``angle_deg`` about its axis."""
+    half = np.deg2rad(angle_deg) / 2
+    turn = RigidTransform((float(np.cos(half)), 0.0, 0.0, float(np.sin(half))), (0.0, 0.0, 0.0))
+    rotation = (turn @ RigidTransform(pose.quat_wxyz, (0.0, 0.0, 0.0))).rotation_matrix()
+    return RigidTransform.from_matrix(rotation, -rotation @ (pose.center() + shift_m))
+
+
+def make_world(num_queries: int = 40, seed: int = 0) -> World:
+    rng = np.random.default_rng(seed)
+    world = World()
+
+    def on_ring(along: float) -> np.ndarray:
+        return np.array([20 * np.cos(along), 10 * np.sin(along), 1.6])
+
+    for i in range(60):
+        along = 2 * np.pi * i / 60
+        world.mapped[f"map/{i:03d}.jpg"] = upright_camera(on_ring(along), along)
+    for i in range(num_queries):
+        condition = "night" if i % 4 == 0 else "day"
+        name = f"query/{condition}/{i:05d}.jpg"
+        along = rng.uniform(0, 2 * np.pi)
+        world.truth[name] = upright_camera(on_ring(along) + rng.normal(size=3), along)
+        world.conditions[name] = condition
+        if i % 10 == 8:
+            fields = {"reason": "6 inliers, 12 needed", "num_inliers": 6}
+        elif i % 10 == 4:
+            fields = {"reason": "no matches", "fallback": "retrieval"}
+            world.estimated[name] = world.mapped[f"map/{i % 60:03d}.jpg"]
+        else:
+            error = 10 ** rng.normal(-1.5, 0.7)
+            shift = rng.normal(size=3)
+            shift *= error / np.linalg.norm(shift)
+            world.estimated[name] = displaced(world.truth[name], shift, 5 * error)
+            inliers = int(rng.integers(12, 250))
+            fields = {"num_matches": 300, "num_inliers": inliers}
+        counts = {"num_matches": 0, "num_inliers": 0}
+        world.statuses[name] = LocalizationResult(name=name, **counts | fields)
+    return world
+
+
+def write_kapture(
+    root: Path,
+    images: Sequence[str],
+    poses: Mapping[str, RigidTransform],
+    camera: Camera | None = None,
+) -> Path:
+    """A kapture folder of one camera: all ``images`` recorded, ``poses`` as trajectories."""
+    sensor = Sensor.from_camera(camera or Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
+    stamped = dict(enumerate(sorted(images)))
+    data = KaptureData(
+        sensors={"cam0": sensor},
+        rigs={},
+        trajectories={(t, "cam0"): poses[i] for t, i in stamped.items() if i in poses},
+        records_camera={(t, "cam0"): image for t, image in stamped.items()},
+        records_depth={},
+    )
+    write_sensors(root, data)
+    return root
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order; collects ids, references and the visible text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.scripts: list[str] = []
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.pieces: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+        # every reference is an id of the page, data inside it, or the 3D view in the same folder
+        assert len(self.ids) == len(set(self.ids))
+        for reference in self.references:
+            ours = reference.startswith("data:") or reference == "view.html"
+            assert ours or reference.removeprefix("#") in self.ids
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.pieces).split())
+
+    @property
+    def images(self) -> list[str]:
+        return [r for r in self.references if r.startswith("data:image/jpeg;base64,")]
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.note(attrs)
+        # the one script is ours: no address, and nothing of the data in it
+        if tag == "script":
+            assert not attrs and "script" not in self.scripts
+            self.scripts.append(tag)
+        if tag not in VOID_ELEMENTS:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.note(attrs)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.pieces.append(data)
+
+    def note(self, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name in ("href", "xlink:href", "src"):
+                self.references.append(value or "")
+            self.references += re.findall(r"url\(([^)]*)\)", value or "")
 
 
 def evaluate_poses(

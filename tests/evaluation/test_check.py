@@ -198,7 +198,7 @@ def named(
         (lambda name: name.replace(".jpg", ".JPG"), AACHEN, "IMG_0.JPG should be IMG_0.jpg"),
     ],
 )
-def test_names_that_are_wrong_in_one_way(
+def test_names_with_one_systematic_error(
     check: Check, change: Callable[[str], str], expected: Mapping[str, str], words: str
 ) -> None:
     (finding,) = named(check, list(map(change, expected)), expected)

@@ -19,7 +19,7 @@ def at(x_m: float) -> RigidTransform:
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (x_m, 0.0, 0.0))
 
 
-def test_confidences_that_are_true_have_no_calibration_error() -> None:
+def test_calibration_error() -> None:
     rng = np.random.default_rng(0)
     claimed = rng.uniform(0, 1, 200_000)
     right = rng.uniform(0, 1, 200_000) < claimed
@@ -45,7 +45,7 @@ def status(image: str, confidence: float | None, localized: bool = True) -> Loca
     )
 
 
-def test_of_a_result() -> None:
+def test_confidence_of_a_result() -> None:
     truth = {name: at(0.0) for name in "abcd"}
     result = {"a": at(0.1), "b": at(100.0), "c": at(0.2), "stray": at(0.0)}
     statuses = {
@@ -79,7 +79,7 @@ def test_of_a_result() -> None:
         evaluate_poses({}, {"a": at(0.0)}, nowhere=["a"])
 
 
-def test_recall_also_counts_doubtful_poses_as_misses() -> None:
+def test_recall_above_a_confidence() -> None:
     truth = {name: at(float(row)) for row, name in enumerate("abcd")}
     statuses = {
         name: status(name, confidence)

@@ -59,7 +59,7 @@ names = st.text(
 
 
 @given(st.dictionaries(names, poses, max_size=6), pairs)
-def test_every_bit_reads_back(
+def test_pose_files_round_trip(
     tmp_path_factory: pytest.TempPathFactory,
     written: dict[str, RigidTransform],
     rows: list[RelativePose],
@@ -89,7 +89,7 @@ def test_pose_files_have_the_servers_format(tmp_path: Path) -> None:
         write_pose_file(tmp_path / "file" / "poses.txt", {"a.jpg": HERE})
 
 
-def test_a_list_names_the_rows_and_orders_them() -> None:
+def test_the_challenge_s_list_gives_names_and_order() -> None:
     listed = {"night/rear/2.jpg": "rear/2.png", "dawn/rear/1.jpg": "rear/1.png", "x.jpg": "x.png"}
     given_poses = dict.fromkeys(["dawn/rear/1.jpg", "night/rear/2.jpg", "dawn/left/1.jpg"], HERE)
     text = format_pose_file(given_poses, names=listed)
@@ -106,7 +106,7 @@ def test_a_list_names_the_rows_and_orders_them() -> None:
         (None, "pair 1 2 has no pose; MLAD wants every row"),
     ],
 )
-def test_a_pose_that_must_not_be_handed_in(
+def test_invalid_poses_are_not_written(
     tmp_path: Path, pose: RigidTransform | None, words: str
 ) -> None:
     with pytest.raises(DataError, match=words):
@@ -134,7 +134,7 @@ def test_a_pose_that_must_not_be_handed_in(
         *("no newline at the end", "comment", "COLMAP's images.txt", "its header, a failure"),
     ],
 )
-def test_foreign_habits_are_taken(tmp_path: Path, text: str) -> None:
+def test_variants_of_other_tools_are_read(tmp_path: Path, text: str) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(text, encoding="utf-8", newline="")
     assert read_pose_file(path) == {"a.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))}
@@ -173,8 +173,8 @@ BROKEN_PAIRS = [
 
 @pytest.mark.parametrize(
     ("read", "good", "line", "words"),
-    [(read_pose_file, GOOD, *one) for one in BROKEN]
-    + [(read_mlad_file, GOOD_PAIR, *one) for one in BROKEN_PAIRS]
+    [(read_pose_file, GOOD, *row) for row in BROKEN]
+    + [(read_mlad_file, GOOD_PAIR, *row) for row in BROKEN_PAIRS]
     + [(read_mlad_file, "1 2\n", GOOD_PAIR, "9 columns instead of 2, as in the rows before")],
 )
 def test_broken_lines_are_named(
@@ -187,7 +187,7 @@ def test_broken_lines_are_named(
     assert caught.value.line == 3 and str(caught.value).startswith(f"{path}:3: ")
 
 
-def test_short_names_find_their_images() -> None:
+def test_short_names_are_matched_with_images() -> None:
     images = ["q/day/1.jpg", "q/day/2.jpg", "q/night/2.jpg"]
     result = poses_by_image({"1.jpg": HERE, "q/day/2.jpg": HERE, "9.jpg": HERE}, images)
     assert list(result) == ["q/day/1.jpg", "q/day/2.jpg", "9.jpg"]
@@ -202,7 +202,7 @@ def test_short_names_find_their_images() -> None:
         poses_by_image({"rear/1.png": HERE, "dawn/rear/1.jpg": HERE}, listed, listed)
 
 
-def test_names_that_end_a_path_or_have_another_ending() -> None:
+def test_names_by_path_end_and_other_suffix() -> None:
     images = [
         "v2/dawn/rear/1.jpg",
         "v2/dusk/rear/2.jpg",

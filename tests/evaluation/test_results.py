@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
+from scored import write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
@@ -38,13 +38,13 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 
 
 @pytest.fixture
-def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
+def truth(world: Any, tmp_path: Path) -> Path:
+    return write_kapture(tmp_path / "query_gt", list(world.truth), world.truth)
 
 
 @pytest.fixture
-def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
+def result(world: Any, tmp_path: Path) -> Path:
+    folder = write_kapture(tmp_path / "localized", list(world.truth), world.estimated)
     write_status(folder / "status.csv", world.statuses.values())
     return folder
 
@@ -61,11 +61,11 @@ def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
         (["a/b/c", "a/d/e/c"], ["b", "d/e"]),
     ],
 )
-def test_labels_tell_results_apart(paths: list[str], labels: list[str]) -> None:
+def test_labels_of_results_are_distinct(paths: list[str], labels: list[str]) -> None:
     assert distinct_labels([Path(path) for path in paths]) == labels
 
 
-def test_conditions_from_folders_where_no_table_has_them() -> None:
+def test_conditions_from_folder_names() -> None:
     rules = Benchmark(protocol=protocol_of("robotcar"))
     images = ["night-rain/rear/1.jpg", "dawn/left/2.jpg", "left/3.jpg", "dawn/night/4.jpg"]
     assert rules.conditions(images) == {
@@ -82,9 +82,7 @@ def test_conditions_from_folders_where_no_table_has_them() -> None:
     }
 
 
-def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path]
-) -> None:
+def test_results_in_other_local_frames(world: Any, tmp_path: Path) -> None:
     truth_world = World(official_from_local=SimilarityTransform(translation=(100.0, 20.0, 3.0)))
     other_world = World(
         official_from_local=SimilarityTransform(
@@ -97,23 +95,23 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     names = list(world.truth)
     official = {n: truth_world.pose_in_official(p) for n, p in world.estimated.items()}
     moved = {n: other_world.pose_in_local(p) for n, p in official.items()}
-    truth = kaptures(tmp_path / "one/query_gt", names, world.truth)
-    here = kaptures(tmp_path / "one/localized", names, world.estimated)
-    there = kaptures(tmp_path / "two/localized", names, moved)
+    truth = write_kapture(tmp_path / "one/query_gt", names, world.truth)
+    folder = write_kapture(tmp_path / "one/localized", names, world.estimated)
+    moved_folder = write_kapture(tmp_path / "two/localized", names, moved)
     write_pose_file(tmp_path / "poses.txt", official)
     actual = evaluate_results(
-        [here, there, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
+        [folder, moved_folder, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
     )
-    first, *others = (one.errors.position_m for one in actual)
+    first, *others = (evaluation.errors.position_m for evaluation in actual)
     for other in others:
         np.testing.assert_allclose(other, first, rtol=0, atol=1e-9)
     # the guard: in its own frame it is metres off
-    wrong = evaluate_results([kaptures(tmp_path / "lone", names, moved)], truth, Benchmark())
+    wrong = evaluate_results([write_kapture(tmp_path / "lone", names, moved)], truth, Benchmark())
     assert np.median(wrong[0].errors.position_m) > 1.0
 
 
-def test_truth_in_the_official_frame_is_brought_to_the_maps(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path], caplog: pytest.LogCaptureFixture
+def test_truth_in_the_official_frame(
+    world: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """As a dataset's owner has it, outside of any import."""
     similarity = SimilarityTransform(
@@ -123,12 +121,12 @@ def test_truth_in_the_official_frame_is_brought_to_the_maps(
     run, names = tmp_path / "run", list(world.truth)
     write_world(run / "megloc", official_world)
     write_protocol(run / "megloc", Protocol())
-    local = kaptures(run / "query_gt", names, world.truth)
+    local = write_kapture(run / "query_gt", names, world.truth)
     official = {name: official_world.pose_in_official(pose) for name, pose in world.truth.items()}
-    actual = kaptures(run / "localized", names, world.estimated)
+    actual = write_kapture(run / "localized", names, world.estimated)
     expected = evaluate(actual, local).errors.position_m
     assert not caplog.records
-    errors = evaluate(actual, kaptures(tmp_path / "owner", names, official)).errors.position_m
+    errors = evaluate(actual, write_kapture(tmp_path / "owner", names, official)).errors.position_m
     np.testing.assert_allclose(errors, expected, rtol=0, atol=1e-6)
     assert "owner is in the dataset's official frame" in caplog.text
 
@@ -151,12 +149,12 @@ def test_the_challenges_names_are_read_back(
     assert from_file.without_truth == ()
 
 
-def test_context_of_a_result(tmp_path: Path, kaptures: Callable[..., Path]) -> None:
+def test_context_of_a_result(tmp_path: Path) -> None:
     here = {"m.jpg": RigidTransform.identity()}
     workspace = tmp_path / "run"
-    kaptures(workspace / "mapping", ["m.jpg"], here)
-    kaptures(workspace / "query", ["q.jpg", "r.jpg"], {})
-    result = kaptures(workspace / "localized", ["q.jpg"], {})
+    write_kapture(workspace / "mapping", ["m.jpg"], here)
+    write_kapture(workspace / "query", ["q.jpg", "r.jpg"], {})
+    result = write_kapture(workspace / "localized", ["q.jpg"], {})
     # not a workspace yet: the result itself is all there is
     assert workspace_of(result) is None and side_tables_near(result) is None
     alone = context_of(result)
@@ -235,13 +233,13 @@ def test_colmap_models_are_truth_and_result(
         assert row.median_position_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_names_that_do_not_fit_are_an_error(world: Any, truth: Path, tmp_path: Path) -> None:
+def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) -> None:
     write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
     with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
 
 
-def test_alignment_is_reported_and_done() -> None:
+def test_alignment() -> None:
     rng = np.random.default_rng(0)
     turns = Rotation.random(10, random_state=0).as_matrix()
     true = {

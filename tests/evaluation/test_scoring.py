@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scored import evaluate_poses
+from scored import evaluate_poses, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate_results
@@ -58,9 +57,7 @@ def test_every_true_query_is_counted_once(world: Any) -> None:
 
 
 @pytest.mark.parametrize(("times", "low", "high"), [(1.0, 0.93, 0.97), (2.0, 0.1, 0.3)])
-def test_errors_are_as_large_as_their_covariances_claim_or_not(
-    times: float, low: float, high: float
-) -> None:
+def test_share_of_errors_within_covariances(times: float, low: float, high: float) -> None:
     """Errors drawn from the covariances lie within the 95 % region in 95 % of all cases."""
     rng = np.random.default_rng(0)
     estimated, truth, covariances = {}, {}, {}
@@ -84,7 +81,7 @@ def test_errors_are_as_large_as_their_covariances_claim_or_not(
     assert "Covariance" not in report_text(evaluate_poses(estimated, truth))
 
 
-def test_images_without_truth_or_not_scored_are_reported_and_not_counted() -> None:
+def test_images_without_truth_are_not_counted() -> None:
     evaluation = evaluate_poses({"b": HERE, "x": HERE, "c": HERE}, {"a": HERE, "b": HERE})
     assert evaluation.without_truth == ("c", "x")
     assert evaluation.row().num_queries == 2
@@ -95,7 +92,7 @@ def test_images_without_truth_or_not_scored_are_reported_and_not_counted() -> No
     assert (evaluation.not_scored, evaluation.without_truth) == (("b",), ("unknown",))
 
 
-def test_statuses_tell_fallback_and_reason() -> None:
+def test_outcomes_and_reasons_from_statuses() -> None:
     statuses = {
         "a": LocalizationResult(name="a", num_matches=9, num_inliers=5),
         "b": LocalizationResult(name="b", reason="dark", fallback="retrieval"),
@@ -113,7 +110,7 @@ def test_statuses_tell_fallback_and_reason() -> None:
     ]
 
 
-def test_nothing_to_count_is_an_error() -> None:
+def test_results_without_scored_queries_are_refused() -> None:
     for truth, options in (({}, {}), ({"a": HERE}, {"scored": set()})):
         with pytest.raises(DataError, match="no query with a true pose"):
             evaluate_poses({"a": HERE}, truth, **options)
@@ -144,9 +141,7 @@ def evaluate_all(
 
 
 @pytest.mark.parametrize(("distance_m", "turn_deg"), [(10.0, 1.0), (3.0, 20.0), (50.0, 0.2)])
-def test_a_rotation_costs_the_chord_it_cuts_and_a_shift_its_length(
-    distance_m: float, turn_deg: float
-) -> None:
+def test_relative_errors_of_a_rotation_and_a_shift(distance_m: float, turn_deg: float) -> None:
     # right place, wrong heading: the reference is seen on a circle around the query
     at, turned = [distance_m, 0.0, 0.0], pose_at([distance_m, 0.0, 0.0], turn_deg)
     references, pairs = {"ref/0.png": pose_at([0.0, 0.0, 0.0], 33.0)}, pairs_of(["q.png"])
@@ -161,7 +156,7 @@ def test_a_rotation_costs_the_chord_it_cuts_and_a_shift_its_length(
         assert errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
 
 
-def test_pairs_count_and_files_are_conditions() -> None:
+def test_mlad_pairs_and_conditions() -> None:
     truth = {f"q{i}.png": pose_at([i, 0.0, 0.0]) for i in range(4)}
     estimated = {
         "q0.png": pose_at([0.09, 0.0, 0.0]),
@@ -199,7 +194,7 @@ def test_pairs_count_and_files_are_conditions() -> None:
 
 
 @pytest.fixture
-def challenge(tmp_path: Path, kaptures: Callable[..., Path]) -> tuple[Path, Path]:
+def challenge(tmp_path: Path) -> tuple[Path, Path]:
     """A workspace with two relocalization files, one query of six without a pose; a result."""
     rng = np.random.default_rng(4)
     workspace, files, tables = tmp_path / "workspace", tmp_path / "submission", []
@@ -211,9 +206,9 @@ def challenge(tmp_path: Path, kaptures: Callable[..., Path]) -> tuple[Path, Path
         name: pose_at((pose.center() + rng.normal(size=3) * 0.1).tolist(), 5.0 * int(name[2:5]) + 1)
         for name, pose in list(truth.items())[:-1]
     }
-    kaptures(workspace / "mapping", list(references), references)
-    kaptures(workspace / "query_gt", names, truth)
-    kaptures(workspace / "localized", names, estimated)
+    write_kapture(workspace / "mapping", list(references), references)
+    write_kapture(workspace / "query_gt", names, truth)
+    write_kapture(workspace / "localized", names, estimated)
     write_protocol(workspace / "megloc", protocol_of("4seasons"))
     files.mkdir()
     for letter, reference in reference_of.items():
@@ -233,7 +228,7 @@ def challenge(tmp_path: Path, kaptures: Callable[..., Path]) -> tuple[Path, Path
     return workspace, files
 
 
-def test_pose_files_give_the_figures_of_the_folder(
+def test_pose_files_and_folders_have_equal_figures(
     challenge: tuple[Path, Path], tmp_path: Path
 ) -> None:
     workspace, files = challenge

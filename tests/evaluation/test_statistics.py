@@ -70,7 +70,7 @@ def test_a_large_paired_difference_is_real_although_intervals_overlap() -> None:
     assert other.row().recall[0].high > better.row().recall[0].low
 
 
-def test_every_threshold_and_pair_is_tested_and_corrected() -> None:
+def test_tests_of_all_thresholds_and_pairs_are_corrected() -> None:
     rng = np.random.default_rng(1)
     thresholds = [METRE, Threshold(position_m=5.0, angle_deg=10.0)]
     results = [result(x, 10 ** rng.normal(0, 1, 60), thresholds=thresholds) for x in "ABC"]

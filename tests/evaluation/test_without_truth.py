@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from scored import Page, write_kapture
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.comparison import (
@@ -109,20 +109,18 @@ def test_agreement_of_two_results(result: WithoutTruth, first: Result) -> None:
     assert [at.num_within for at in row.within] == [3, 3] and row.median_m == 0.0
 
 
-def test_one_pose_file_alone_and_no_pose_at_all(
-    second: Result, page_of: Callable[[str], Any]
-) -> None:
+def test_a_single_result_and_one_without_poses(second: Result) -> None:
     result = evaluate_without_truth([second])
     text = report_text(result)
     assert "No true poses were given." in text
     assert "agree (%)" not in text
-    assert "both have a pose" not in page_of(render_report(result)).text
+    assert "both have a pose" not in Page(render_report(result)).text
     result = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
     assert result.evaluations[0].rows[0].num_missing == 1
-    assert "From above" not in page_of(render_report(result)).text
+    assert "From above" not in Page(render_report(result)).text
 
 
-def test_nothing_to_say_is_refused(first: Result) -> None:
+def test_empty_or_equal_labels_are_refused(first: Result) -> None:
     with pytest.raises(DataError, match="no query"):
         evaluate_without_truth([Result("x", {}, ())])
     for results in ([first, first], []):
@@ -130,11 +128,11 @@ def test_nothing_to_say_is_refused(first: Result) -> None:
             evaluate_without_truth(results)
 
 
-def test_from_a_workspace(first: Result, tmp_path: Path, kaptures: Callable[..., Path]) -> None:
+def test_from_a_workspace(first: Result, tmp_path: Path) -> None:
     workspace = tmp_path / "workspace"
-    kaptures(workspace / "mapping", list(MAP), MAP)
-    kaptures(workspace / "query", [*CONDITIONS, "d/training.jpg"], {})
-    kaptures(workspace / "localized", [*CONDITIONS, "d/training.jpg"], first.poses)
+    write_kapture(workspace / "mapping", list(MAP), MAP)
+    write_kapture(workspace / "query", [*CONDITIONS, "d/training.jpg"], {})
+    write_kapture(workspace / "localized", [*CONDITIONS, "d/training.jpg"], first.poses)
     write_status(workspace / "localized/status.csv", first.statuses.values())
     tables = workspace / "megloc"
     write_protocol(tables, protocol_of("aachen"))

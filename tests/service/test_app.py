@@ -85,7 +85,7 @@ def test_answers_equal_the_localizer(
 
 
 @pytest.mark.parametrize(("orientation", "focal_35mm"), [(1, 27), (6, 27), (1, None)])
-def test_a_photograph_without_camera_is_localized_as_by_the_package(
+def test_photographs_without_camera_equal_the_localizer(
     client: TestClient,
     localizer: Localizer,
     photos: list[Photo],
@@ -114,7 +114,7 @@ def test_a_photograph_without_camera_is_localized_as_by_the_package(
         assert body["remarks"] == list(actual.remarks)
 
 
-def test_a_photograph_of_something_else_has_a_reason(client: TestClient) -> None:
+def test_an_unrelated_photograph_fails_with_a_reason(client: TestClient) -> None:
     answer = client.post(
         "/localize", files={"image": picture(400, 300)}, data={"camera": pinhole(400, 300)}
     )
@@ -168,7 +168,7 @@ def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
         ({"path": "/etc/passwd"}, "camera.path: Extra inputs"),
     ],
 )
-def test_impossible_cameras_are_refused(
+def test_invalid_cameras_are_refused(
     client: TestClient, photos: list[Photo], camera: str | dict[str, Any], words: str
 ) -> None:
     sent = photos[0].camera_json(**camera) if isinstance(camera, dict) else camera
@@ -194,13 +194,13 @@ def test_invalid_images_are_refused(
         refused(raw, status, words)
 
 
-def test_another_content_type_is_named(client: TestClient, photos: list[Photo]) -> None:
+def test_other_content_types_are_refused(client: TestClient, photos: list[Photo]) -> None:
     for kind in ("application/json", "application/x-www-form-urlencoded"):
         answer = client.post("/localize", content=photos[0].content, headers={"content-type": kind})
         refused(answer, 415, f"Content-Type says {kind}: send image/jpeg")
 
 
-def test_a_body_that_is_too_large_is_refused(localizer: Localizer) -> None:
+def test_large_requests_are_refused(localizer: Localizer) -> None:
     with client_of(localizer, threads=1, max_mb=0.01) as client:
         refused(client.post("/localize", content=bytes(10_001)), 413, "larger than 0.01 MB")
         chunks = (bytes(1000) for _ in range(11))  # of a length that is not told
@@ -208,9 +208,7 @@ def test_a_body_that_is_too_large_is_refused(localizer: Localizer) -> None:
         refused(client.post("/localize", content=bytes(9_999)), 415)
 
 
-def test_the_token_is_needed_for_all_that_tells_of_the_map(
-    localizer: Localizer, photos: list[Photo]
-) -> None:
+def test_token_protects_localization_and_map(localizer: Localizer, photos: list[Photo]) -> None:
     token = "correct horse battery"
     with client_of(localizer, threads=1, token=token) as client:
         wrong = ("", "Bearer", f"Basic {token}", "Bearer correct horse batter", f"Bearer {token}s")
@@ -227,7 +225,7 @@ def test_the_token_is_needed_for_all_that_tells_of_the_map(
         assert client.get("/map", headers=right).status_code == 200
 
 
-def test_more_images_than_may_wait_are_refused(
+def test_a_full_queue_refuses_images(
     localizer: Localizer, photos: list[Photo], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
@@ -243,16 +241,16 @@ def test_more_images_than_may_wait_are_refused(
         ThreadPoolExecutor(6) as pool,
     ):
         sent = [pool.submit(client.post, "/localize", **photos[0].form()) for _ in range(6)]
-        full = [one.result() for one in itertools.islice(as_completed(sent), 4)]
+        full = [future.result() for future in itertools.islice(as_completed(sent), 4)]
         for answer in full:
             refused(answer, 503, "too many images are waiting")
             assert answer.headers["retry-after"] == "2"
         assert client.get("/health").status_code == 200
         go_on.set()
-        assert sorted(one.result().status_code for one in sent) == [200] * 2 + [503] * 4
+        assert sorted(future.result().status_code for future in sent) == [200] * 2 + [503] * 4
 
 
-def test_internal_errors_say_nothing_of_the_machine(
+def test_internal_errors_hide_paths(
     localizer: Localizer, photos: list[Photo], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     errors = DataError("cannot read", path="/srv/secret/points3d.txt"), ValueError("/srv/secret")

@@ -65,7 +65,7 @@ def test_a_slow_client_does_not_block_the_others(port: int, photos: list[Photo])
         assert time.monotonic() - begin < 20
 
 
-def test_a_client_that_is_still_sending_sees_the_refusal(port: int) -> None:
+def test_a_sending_client_receives_the_refusal(port: int) -> None:
     for size in (21_000_000, 50_000_000):
         answer = httpx2.post(f"http://127.0.0.1:{port}/localize", content=bytes(size), timeout=30)
         assert answer.status_code == 413

@@ -14,8 +14,9 @@ from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.training.labels import (
     IGNORED,
+    NEGATIVE_PX,
+    POSITIVE_PX,
     UNMATCHED,
-    LabelOptions,
     PosedView,
     labels_of_homography,
     labels_of_views,
@@ -37,7 +38,6 @@ def brute_force(
     px_a: NDArray[np.float64], px_b: NDArray[np.float64], a: PosedView, b: PosedView
 ) -> list[int]:
     """Labels of a's keypoints with depth, one by one; WITHOUT_DEPTH of the others."""
-    options = LabelOptions()
     a_in_b, known_a, visible_a = reproject(px_a, a, b)
     b_in_a, _, visible_b = reproject(px_b, b, a)
     distance = np.full((len(px_a), len(px_b)), np.inf)
@@ -50,10 +50,10 @@ def brute_force(
         away = np.nan_to_num(np.hypot(*(a_in_b[i] - px_b).T), nan=np.inf).min()
         if not known:
             result.append(WITHOUT_DEPTH)
-        elif mutual and distance[i, j] < options.positive_px:
+        elif mutual and distance[i, j] < POSITIVE_PX:
             result.append(j)
         else:
-            result.append(UNMATCHED if away > options.negative_px else IGNORED)
+            result.append(UNMATCHED if away > NEGATIVE_PX else IGNORED)
     return result
 
 
@@ -90,22 +90,22 @@ def test_labels_equal_brute_force() -> None:
 def test_hidden_keypoints_have_no_partner() -> None:
     a, b = corner_view(pose_at((-1.5, 0, 0), -4, 0)), corner_view(pose_at((1.0, 0, 0), 3, 0))
     px_a = np.random.default_rng(1).uniform((50, 50), (350, 250), (200, 2))
-    there, known, visible = reproject(px_a, a, b)
+    px_in_b, known, visible = reproject(px_a, a, b)
     assert known.all() and visible.sum() > 80
-    exact = labels_of_views(px_a, there[visible], a, b)
+    exact = labels_of_views(px_a, px_in_b[visible], a, b)
     assert (exact.partner_a[visible] == np.arange(visible.sum())).all()
     # an object in front of the second camera
     blocked = np.where(np.arange(400) < 200, 1.0, b.depth.depth_m).astype(np.float32)
     hidden = PosedView(b.camera, b.cam_from_world, DepthView(CAMERA, blocked, IDENTITY))
-    behind = there[visible, 0] < 198
-    labels = labels_of_views(px_a, there[visible], a, hidden)
+    behind = px_in_b[visible, 0] < 198
+    labels = labels_of_views(px_a, px_in_b[visible], a, hidden)
     assert behind.sum() > 20
     assert (labels.partner_a[visible][behind] == IGNORED).all()
-    clear = there[visible, 0] > 202
+    clear = px_in_b[visible, 0] > 202
     assert (labels.partner_a[visible][clear] >= 0).all()
 
 
-def test_without_depth_the_epipolar_line_tells() -> None:
+def test_keypoints_without_depth_by_epipolar_lines() -> None:
     a, b = corner_view(pose_at((-0.5, 0, 0), 0, 0)), corner_view(pose_at((0.5, 0, 0), 0, 0))
     nothing = DepthView(CAMERA, np.zeros((300, 400), np.float32), IDENTITY)
     blind = [PosedView(CAMERA, view.cam_from_world, nothing) for view in (a, b)]
@@ -135,29 +135,31 @@ def test_a_separate_depth_camera_and_distortion() -> None:
     points = origin + along * ((6.0 - origin[2]) / along[:, 2])[:, None]
     on_wall = points[:, 0] < 1.5
     expected = project(DISTORTED, pose_b, points)
-    there, _, visible = reproject(px_a, a, b)
+    px_in_b, _, visible = reproject(px_a, a, b)
     assert (on_wall & visible).sum() > 60
-    np.testing.assert_allclose(there[on_wall & visible], expected[on_wall & visible], atol=0.05)
+    np.testing.assert_allclose(px_in_b[on_wall & visible], expected[on_wall & visible], atol=0.05)
 
 
-def test_a_homography_is_a_plane() -> None:
+def test_labels_of_a_homography_equal_those_of_a_plane() -> None:
     """The wall of the corner, once by its depth and once by the homography between its images."""
     a, b = corner_view(pose_at((-2.5, 0, 0), -8, 2)), corner_view(pose_at((-2.0, 0.2, 0.3), -6, 0))
     grid = np.stack(np.meshgrid(np.arange(20.5, 380, 20), np.arange(20.5, 280, 20)), -1).reshape(
         -1, 2
     )
-    there, _, visible = reproject(grid, a, b)
-    grid, there = grid[visible], there[visible]
-    b_from_a = cv2.findHomography(grid, there)[0]
+    px_in_b, _, visible = reproject(grid, a, b)
+    grid, px_in_b = grid[visible], px_in_b[visible]
+    b_from_a = cv2.findHomography(grid, px_in_b)[0]
     rng = np.random.default_rng(3)
-    px_b = np.concatenate([there + rng.normal(0, 2.5, there.shape), rng.uniform(0, 300, (40, 2))])
+    px_b = np.concatenate(
+        [px_in_b + rng.normal(0, 2.5, px_in_b.shape), rng.uniform(0, 300, (40, 2))]
+    )
     by_depth = labels_of_views(grid, px_b, a, b)
     by_plane = labels_of_homography(grid, px_b, b_from_a, (400, 300), (400, 300))
     np.testing.assert_array_equal(by_depth.partner_a, by_plane.partner_a)
     assert len(by_plane.matches()) > 50 and (by_plane.partner_a == IGNORED).any()
 
 
-def test_overlap_is_of_the_view_that_shows_more() -> None:
+def test_overlap_is_the_smaller_share() -> None:
     near, far = corner_view(pose_at((-2, 0, 2.5), 0, 0)), corner_view(pose_at((-2, 0, 0), 0, 0))
     assert overlap(near, near) == 1.0
     assert overlap(near, far) == overlap(far, near)
@@ -167,12 +169,10 @@ def test_overlap_is_of_the_view_that_shows_more() -> None:
     assert overlap(far, away) == 0.0
 
 
-def test_no_keypoints_no_labels_and_options_in_order() -> None:
+def test_empty_images_have_no_labels() -> None:
     view = corner_view(pose_at((0, 0, 0), 0, 0))
     none, some = np.zeros((0, 2)), np.array([[10.0, 10.0]])
     for px_a, px_b in ((none, some), (some, none), (none, none)):
         labels = labels_of_views(px_a, px_b, view, view)
         assert labels.partner_a.tolist() == [IGNORED] * len(px_a)
         assert len(labels.matches()) == 0
-    with pytest.raises(ValueError, match="smaller than positive_px"):
-        LabelOptions(positive_px=6.0)

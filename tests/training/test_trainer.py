@@ -20,18 +20,11 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.stages.work import Work
-from megloc_kapture.training.pairs import PairOptions, PosedPairs, TrainingPair
-from megloc_kapture.training.train import (
-    DescriptorOptions,
-    Trainer,
-    TrainingData,
-    TrainingOptions,
-    TrainingState,
-    train,
-)
+from megloc_kapture.training.pairs import PosedPairs, TrainingPair
+from megloc_kapture.training.train import DescriptorOptions, Trainer, TrainingOptions, train
 from megloc_kapture.values import ImageFeatures
 
-PAIRS = {"max_size_px": 200}
+MAX_SIZE_PX = 200
 
 
 def options(files: dict[str, str], kind: type[TrainingOptions] = TrainingOptions, **changes: Any):  # type: ignore[no-untyped-def]
@@ -39,7 +32,7 @@ def options(files: dict[str, str], kind: type[TrainingOptions] = TrainingOptions
     return kind.model_validate(
         {
             "features": {"name": "xfeat", "options": chosen},
-            **{"device": "cpu", "pairs": PAIRS, "max_keypoints": 64, "layers": 4},
+            **{"device": "cpu", "max_size_px": MAX_SIZE_PX, "max_keypoints": 64, "layers": 4},
             **{"pairs_per_step": 2, "sinkhorn_iterations": 10, "steps": 6, "check_every": 2},
             **changes,
         }
@@ -62,19 +55,19 @@ class Few:
 
 
 def overfitted(chosen: TrainingOptions, walk: Path) -> list[list[float]]:
-    source = PosedPairs(KaptureFolder(walk), PairOptions.model_validate(PAIRS))
+    source = PosedPairs(KaptureFolder(walk), MAX_SIZE_PX)
     pairs = [source.draw(np.random.default_rng(seed)) for seed in range(8)]
     assert len({pair.keys for pair in pairs}) > 4
     trainer = Trainer(chosen)
     trainer.hold_out({"same": Few(pairs, in_turn=True)})
     before = trainer.evaluate()
-    (state,) = trainer.train([Few(pairs)], TrainingState(0, []))
-    return [before, state.rows[-1][3:]]
+    list(trainer.train([Few(pairs)]))
+    return [before, trainer.rows[-1][3:]]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["matcher", "descriptor"])
-def test_eight_pairs_are_learnt_by_heart(task: str, files: dict[str, str], walk: Path) -> None:
+def test_eight_pairs_are_overfitted(task: str, files: dict[str, str], walk: Path) -> None:
     common = {"learning_rate": 1e-3, "held_out_pairs": 8}
     if task == "matcher":
         chosen = options(files, steps=300, check_every=300, pairs_per_step=4, **common)
@@ -100,59 +93,62 @@ def interrupted_after(step: int) -> Work:
 
 # of descriptors the matcher is a part
 @pytest.mark.slow
-def test_interrupted_and_resumed_is_uninterrupted(
+def test_a_resumed_training_equals_an_uninterrupted_one(
     files: dict[str, str],
     walk: Path,
     other_walk: Path,
     photographs: Path,
     tmp_path: Path,
 ) -> None:
-    chosen = options(files, DescriptorOptions, deep_supervision=True, held_out_pairs=3)
-    data = TrainingData(
-        [KaptureFolder(walk)],
-        [photographs],
-        [KaptureFolder(other_walk)],
-    )
+    chosen = options(files, DescriptorOptions, held_out_pairs=3)
+    data = {
+        "kaptures": [KaptureFolder(walk)],
+        "photographs": [photographs],
+        "held_out": [KaptureFolder(other_walk)],
+    }
     whole, parts = tmp_path / "whole" / "x.safetensors", tmp_path / "parts" / "x.safetensors"
-    last = train(chosen, data, whole)
+    last = train(chosen, whole, **data)
     assert last["step"] == 6 and np.isfinite(list(last.values())).all()
     # in the middle between two that are kept, and at one
     for step in (3, 2):
         with pytest.raises(KeyboardInterrupt):
-            train(chosen, data, parts, work=interrupted_after(step))
+            train(chosen, parts, **data, work=interrupted_after(step))
     state = torch.load(parts.with_suffix(".state.pt"), weights_only=True)
     assert state["step"] == 4
     # threads change nothing beyond rounding
-    assert train(chosen, data, parts, threads=3) == pytest.approx(last, rel=1e-5)
+    assert train(chosen, parts, **data, threads=3) == pytest.approx(last, rel=1e-5)
     names = ["x.csv", "x.json", "x.safetensors", "x.state.pt", "x.overlaps"]
     names += ["x-superglue.safetensors"]
     assert sorted(path.name for path in parts.parent.iterdir()) == sorted(names)
     assert len(list((parts.parent / "x.overlaps").iterdir())) == 2
     # what is done is done
     before = parts.stat().st_mtime_ns
-    assert train(chosen, data, parts) == pytest.approx(last, rel=1e-5)
+    assert train(chosen, parts, **data) == pytest.approx(last, rel=1e-5)
     assert parts.stat().st_mtime_ns == before
     manifest = json.loads(parts.with_suffix(".json").read_text())
     record = manifest["training"]
-    assert [one["images"] for one in record["data"].values()] == [5, 1]
+    assert [source["images"] for source in record["data"].values()] == [5, 1]
     assert record["task"] == "descriptor"
     lines = parts.with_suffix(".csv").read_text().splitlines()
     assert lines[0].startswith("step,learning_rate,loss,") and len(lines) == 4
 
 
-def test_seed_precision_and_start_matter(files: dict[str, str], walk: Path, tmp_path: Path) -> None:
-    data = TrainingData([KaptureFolder(walk)], held_out=[])
+def test_seed_precision_and_initial_weights(
+    files: dict[str, str], walk: Path, tmp_path: Path
+) -> None:
+    data = [KaptureFolder(walk)]
     first = tmp_path / "first.safetensors"
-    whole = train(options(files, steps=2), data, first)
-    half = train(options(files, steps=2, half_precision=True), data, tmp_path / "half.safetensors")
+    whole = train(options(files, steps=2), first, kaptures=data)
+    in_half = options(files, steps=2, half_precision=True)
+    half = train(in_half, tmp_path / "half.safetensors", kaptures=data)
     assert whole["loss"] != half["loss"]
     assert whole["loss"] == pytest.approx(half["loss"], rel=0.05)
-    train(options(files, steps=2, seed=1), data, tmp_path / "second.safetensors")
+    train(options(files, steps=2, seed=1), tmp_path / "second.safetensors", kaptures=data)
     assert first.read_bytes() != (tmp_path / "second.safetensors").read_bytes()
     # on from there, with small steps, is near there
     third = tmp_path / "third.safetensors"
     more = options(files, steps=2, matcher_weights=str(first), learning_rate=1e-7)
-    train(more, data, third)
+    train(more, third, kaptures=data)
     for key, value in load_file(first).items():
         if value.ndim == 3:
             torch.testing.assert_close(load_file(third)[key], value, rtol=0, atol=1e-5)
@@ -168,7 +164,7 @@ def test_a_trained_matcher_is_read_by_the_matcher(
         output,
         kaptures=[walk],
         features="xfeat",
-        set={"features.options": chosen, "steps": 2, "layers": 2, "pairs.max_size_px": 200,
+        set={"features.options": chosen, "steps": 2, "layers": 2, "max_size_px": 200,
              "pairs_per_step": 1, "max_keypoints": 50, "device": "cpu"},
     )  # fmt: skip
     assert last["step"] == 2 and np.isfinite(last["loss"])
@@ -181,7 +177,7 @@ def test_a_trained_matcher_is_read_by_the_matcher(
     assert matches.shape[1] == 2 and len(matches) == len(scores)
 
 
-def test_a_split_superpoint_is_trained_and_read(
+def test_superpoint_descriptors_are_trained_and_read(
     files: dict[str, str], walk: Path, tmp_path: Path
 ) -> None:
     """Random weights: detector frozen, gradients through SuperGlue into the descriptors."""
@@ -193,7 +189,7 @@ def test_a_split_superpoint_is_trained_and_read(
         **{"pairs_per_step": 1, "learning_rate": 1e-3, "max_keypoints": 60},
     )
     output = tmp_path / "night.safetensors"
-    train(chosen, TrainingData([KaptureFolder(walk)]), output)
+    train(chosen, output, kaptures=[KaptureFolder(walk)])
     before, after = load_file(files["superpoint"]), load_file(output)
     assert set(after) == {key for key in before if not key.startswith("convP")}
     assert all(not torch.equal(after[key], before[key]) for key in after)
@@ -213,35 +209,35 @@ def test_a_split_superpoint_is_trained_and_read(
 def test_invalid_training_is_refused(
     files: dict[str, str], walk: Path, photographs: Path, tmp_path: Path
 ) -> None:
-    data = TrainingData([KaptureFolder(walk)])
+    data = {"kaptures": [KaptureFolder(walk)]}
     output = tmp_path / "x.safetensors"
     chosen = options(files, steps=1, layers=2)
     for wrong, message in (
-        (TrainingData(), "nothing to train on"),
-        (TrainingData([KaptureFolder(walk)], held_out=[KaptureFolder(walk)]), "and held out"),
+        ({}, "nothing to train on"),
+        ({**data, "held_out": [KaptureFolder(walk)]}, "and held out"),
     ):
         with pytest.raises(OptionError, match=message):
-            train(chosen, wrong, output)
+            train(chosen, output, **wrong)
     with pytest.raises(OptionError, match="end in .safetensors"):
-        train(chosen, data, tmp_path / "x.pth")
+        train(chosen, tmp_path / "x.pth", **data)
     with pytest.raises(OptionError, match="smaller learning_rate"):
-        train(options(files, learning_rate=1e30), data, output)
+        train(options(files, learning_rate=1e30), output, **data)
     assert not output.exists()
-    train(chosen, data, output)
+    train(chosen, output, **data)
     with pytest.raises(OutputError, match=r"x\.json: is from another training \(options\); -f"):
-        train(options(files, steps=4), data, output)
+        train(options(files, steps=4), output, **data)
     output.with_suffix(".state.pt").write_bytes(b"PK damaged")
     with pytest.raises(
         DataError, match=r"x\.state\.pt: is damaged, or the state of another training"
     ):
-        train(chosen, data, output)
-    assert train(options(files, steps=4), data, output, force=True)["step"] == 4
+        train(chosen, output, **data)
+    assert train(options(files, steps=4), output, **data, force=True)["step"] == 4
     mine = tmp_path / "mine.safetensors"
     mine.write_bytes(b"of somebody else")
     with pytest.raises(OutputError, match="was not written by a training"):
-        train(chosen, data, mine)
+        train(chosen, mine, **data)
     assert mine.read_bytes() == b"of somebody else"
     with pytest.raises(OptionError, match=r"256 dimensions; xfeat has 64"):
         official = tmp_path / "official.safetensors"
         save_file(SuperGlueNet(num_layers=2).state_dict(), official)
-        train(options(files, matcher_weights=str(official)), data, tmp_path / "y.safetensors")
+        train(options(files, matcher_weights=str(official)), tmp_path / "y.safetensors", **data)

@@ -6,7 +6,7 @@ downloader leaves kapture folders.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,8 +25,8 @@ from megloc_kapture.datasets.official import (
     last_part,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
-from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.datasets.reference_map import WITHOUT_DATABASE, check_model_files
+from megloc_kapture.errors import OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.io.dataset_tables import ImageGroup, World
@@ -167,18 +167,12 @@ class Layout:
             return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, k))
 
     def _add_queries(self, images: AachenImages, missing: Missing) -> int:
-        listed: dict[str, Path] = {}
         left_out = 0
         for condition in (DAY, NIGHT):
             path = self.query_list(condition)
             if not missing.require(path):
                 continue
             for position, (name, camera) in enumerate(read_camera_rows(path).items()):
-                require(
-                    listed.setdefault(name, path) == path,
-                    f"image {name!r} is also in {listed[name].name}: a query by day or at night?",
-                    path=path,
-                )
                 if images.version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
                     left_out += 1
                 elif missing.require(self.images / name):
@@ -195,10 +189,10 @@ def from_kapture(
     form: KaptureForm, wanted: Wanted, missing: Missing
 ) -> tuple[AachenImages, dict[str, Path]]:
     """Return the images of kapture folders in the official order, and the file of each."""
-    found = form.read(missing)
-    images = AachenImages(_version_of(form, wanted, found))
+    kapture_images = form.read(missing)
+    images = AachenImages(_version_of(form, wanted, kapture_images))
     cameras: dict[str, int] = {}
-    for image in found:
+    for image in kapture_images:
         if not image.is_query and image.cam_from_world is not None:
             position = len(images.mapping.records_camera)
             camera_id = cameras.setdefault(image.sensor_id, len(cameras))
@@ -206,16 +200,16 @@ def from_kapture(
                 image.name, position, camera_id, image.camera, image.cam_from_world
             )
     for condition in (DAY, NIGHT):
-        queries = [i for i in found if i.is_query and condition in i.name.split("/")[:-1]]
+        queries = [i for i in kapture_images if i.is_query and condition in i.name.split("/")[:-1]]
         for position, image in enumerate(queries):
             images.add_query(image.name, condition, position, image.camera)
-    for image in found:
+    for image in kapture_images:
         require(
             not image.is_query or image.name in images.conditions,
             f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name",
             path=form.root,
         )
-    return images, {image.name: image.file for image in found}
+    return images, {image.name: image.file for image in kapture_images}
 
 
 def _version_of(form: KaptureForm, wanted: Wanted, images: Sequence[KaptureImage]) -> Version:
@@ -292,10 +286,10 @@ class Aachen:
         if (form := _kapture_form(root)) is not None:
             images, files = from_kapture(form, self.options.version, missing)
             remarks = [f"Read from kapture folders, as v{images.version}."]
-            return self._dataset(images, lambda _: form.root, missing, remarks, image_files=files)
+            return self._dataset(images, missing, remarks, image_files=files)
         layout = Layout(root)
         images, left_out = layout.read(layout.version(self.options.version), missing)
-        remarks, reference = [], None
+        remarks, model = [], dict[str, Any]()
         if images.version == "1.0" and not layout.database_intrinsics.is_file():
             remarks.append(
                 f"Without {layout.database_intrinsics.name} the map images' principal points are "
@@ -306,23 +300,22 @@ class Aachen:
                 f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
             )
         if self.options.reference_model:
-            database = layout.feature_database if images.version == "1.0" else None
-            points = partial(layout.read_points, images.version)
-            reference = ReferenceModel(points, database)
-            remarks += reference.remarks()
+            model["reference"] = partial(layout.read_points, images.version)
+            if images.version == "1.0" and layout.feature_database.is_file():
+                model["reference_database"] = layout.feature_database
+            else:
+                remarks.append(WITHOUT_DATABASE)
         return self._dataset(
             images,
-            layout.query_list,
             missing,
             remarks,
             links={"": layout.images},
-            reference=reference,
+            **model,
         )
 
     def _dataset(
         self,
         images: AachenImages,
-        lists: Callable[[str], Path],
         missing: Missing,
         remarks: list[str],
         **more: Any,
@@ -334,7 +327,7 @@ class Aachen:
             query=images.query,
             query_gt=truth,
             groups={name: ImageGroup(condition=condition) for name, condition in conditions},
-            names=_pose_file_names(images, lists),
+            names={query: last_part(query) for query in images.conditions},
             protocol=protocol_of(self.name).model_copy(
                 update={"pose_file_stem": _POSE_FILE_STEMS[images.version]}
             ),
@@ -347,19 +340,6 @@ class Aachen:
 
 def _kapture_form(root: Path) -> KaptureForm | None:
     return KaptureForm.find(root) if Layout(root).absent() else None
-
-
-def _pose_file_names(images: AachenImages, lists: Callable[[str], Path]) -> dict[str, str]:
-    names: dict[str, str] = {}
-    taken: dict[str, str] = {}
-    for query, condition in images.conditions.items():
-        name = names[query] = last_part(query)
-        other = taken.setdefault(name, query)
-        if other != query:
-            raise DataError(
-                f"{query} and {other} would both be {name} in the pose file", path=lists(condition)
-            )
-    return names
 
 
 def _summary(images: AachenImages) -> list[Count]:

@@ -25,7 +25,6 @@ CAMERA_FILES = ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
 STEREO_FILE = "undistorted_calib_stereo.txt"
 
 _TIMESTAMP = re.compile(r"[1-9][0-9]{0,18}")
-_MAX_SCALE = 1e6
 # relocalization files of 2021, 2020 (in the source's folder) and 2022
 _RELOCALIZATION_NAMES = (
     re.compile(r"relocalizationFile_(?P<source>.+)_to_(?P<target>.+)\.txt"),
@@ -63,35 +62,26 @@ def read_pinhole(path: Path) -> Camera:
             model == "Pinhole" and len(params) in (4, 8) and not any(params[4:]),
             "expected 'Pinhole fx fy cx cy', without distortion, as images are undistorted",
         )
-        require(len(sizes) in (1, 3) and sizes[0] == sizes[-1], "expected one image size, twice")
         width, height = map(int, sizes[0])
         return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
-@dataclass(frozen=True, slots=True)
-class GnssPose:
-    """A row of ``GNSSPoses.txt``; None if a field is missing.
-
-    ``slam_from_cam`` is the undistorted left camera's pose in SLAM units, ``scale`` metres per
-    unit, ``fusion_quality`` 2 for fused with GNSS, 1 for interpolated, 0 for none.
-    """
-
-    slam_from_cam: RigidTransform
-    scale: float | None
-    fusion_quality: float | None
+# pose of the undistorted left camera in SLAM units, metres per unit, and the fusion quality (2
+# fused with GNSS, 1 interpolated, 0 none); None if a field is missing
+GnssPose = tuple[RigidTransform, float | None, float | None]
 
 
 def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
-    """Read ``GNSSPoses.txt`` by timestamp (ns).
+    """Read ``slam_from_cam``, scale and fusion quality of ``GNSSPoses.txt`` by timestamp (ns).
 
     A row is ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; published rows have
     10 fields, their header announces 11.
     """
 
     def parse(fields: list[str]) -> GnssPose:
-        scale = _scale(fields[7]) if len(fields) > 7 else None
+        scale = float(fields[7]) if len(fields) > 7 else None
         quality = float(fields[8]) if len(fields) > 8 else None
-        return GnssPose(_transform(fields[:7]), scale, quality)
+        return _transform(fields[:7]), scale, quality
 
     return _by_timestamp(path, parse)
 
@@ -110,14 +100,8 @@ def _by_timestamp(path: Path, parse: Callable[[list[str]], Row]) -> dict[int, Ro
     rows: dict[int, Row] = {}
     with reading_lines(path, comments=True) as lines:
         for timestamp, *fields in map(fields_of, lines):
-            rows[_timestamp(timestamp)] = parse(fields)
-    require(rows, "the file has no rows", path=path)
+            rows[int(timestamp)] = parse(fields)
     return rows
-
-
-def _timestamp(text: str) -> int:
-    require(_TIMESTAMP.fullmatch(text), f"{text!r} is not a timestamp in whole nanoseconds")
-    return int(text)
 
 
 def _transform(fields: Sequence[str]) -> RigidTransform:
@@ -125,30 +109,12 @@ def _transform(fields: Sequence[str]) -> RigidTransform:
     return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
 
 
-def _scale(text: str) -> float:
-    scale = float(text)
-    require(
-        1 / _MAX_SCALE < scale < _MAX_SCALE, f"scale {text} is not a factor between units of length"
-    )
-    return scale
+def read_transformations(path: Path) -> tuple[RigidTransform, RigidTransform, float | None]:
+    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers.
 
-
-@dataclass(frozen=True, slots=True)
-class Transformations:
-    """The transforms from a recording's SLAM world to the earth (ECEF), e.
-
-    The level visual world is w, the scene's east-north-up frame is gpsw. ``gnss_scale`` is metres
-    per SLAM unit, or None.
+    Return ``scene_from_slam`` without scale (the scene's axes are east, north and up),
+    ``earth_from_scene`` (ECEF), and metres per SLAM unit or None.
     """
-
-    s_from_as: RigidTransform
-    w_from_gpsw: RigidTransform
-    e_from_gpsw: RigidTransform
-    gnss_scale: float | None
-
-
-def read_transformations(path: Path) -> Transformations:
-    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers."""
     texts: dict[str, str] = {}
     name = ""
     with reading_lines(path) as lines:
@@ -161,17 +127,16 @@ def read_transformations(path: Path) -> Transformations:
     for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
         with named(path, about=name):
             transforms.append(_transform(fields_of(texts.get(name, ""))))
-    with named(path):
-        scale = _scale(texts["GNSS scale"]) if "GNSS scale" in texts else None
-    s_from_as, w_from_gpsw, e_from_gpsw = transforms
-    return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
+    scale = float(texts["GNSS scale"]) if "GNSS scale" in texts else None
+    world_from_slam, world_from_scene, earth_from_scene = transforms
+    return world_from_scene.inverse() @ world_from_slam, earth_from_scene, scale
 
 
 def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
     """Return source and target recording of a file name; the source may be omitted."""
     for pattern in _RELOCALIZATION_NAMES:
-        if found := pattern.fullmatch(name):
-            parts = found.groupdict()
+        if match := pattern.fullmatch(name):
+            parts = match.groupdict()
             return parts.get("source"), parts["target"]
     return None
 
@@ -180,10 +145,9 @@ def read_relocalization(path: Path) -> list[RelativePose]:
     rows: dict[tuple[int, int], RelativePose] = {}
     with reading_lines(path, comments=True) as lines:
         for first, second, *fields in map(fields_of, lines):
-            reference, query = _timestamp(first), _timestamp(second)
+            reference, query = int(first), int(second)
             pose = _transform(fields) if fields else None
             rows.setdefault((reference, query), RelativePose(reference, query, pose))
-    require(rows, "no pair in the file", path=path)
     return list(rows.values())
 
 
@@ -260,13 +224,15 @@ class RelocalizationFile:
 
 
 def find_recordings(root: Path) -> dict[str, Recording]:
-    found = {
+    recordings = {
         folder.name: Recording(folder.name, folder)
         for folder in _folders(root)
         if any((folder / mark).exists() for mark in _MARKS)
     }
-    require(found, f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it", path=root)
-    return found
+    require(
+        recordings, f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it", path=root
+    )
+    return recordings
 
 
 def _folders(root: Path) -> list[Path]:
@@ -277,7 +243,7 @@ def _folders(root: Path) -> list[Path]:
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
     """Find relocalization files; without a source in their names they lie in its folder."""
     known = set(recordings)
-    found: dict[str, RelocalizationFile] = {}
+    files: dict[str, RelocalizationFile] = {}
     for folder in _RELOCALIZATION_FOLDERS:
         for path in sorted(root.glob(f"{folder}/reloc*.txt")):
             named = parse_relocalization_name(path.name)
@@ -293,10 +259,10 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
                     "of the reference recording",
                     path=path,
                 )
-            if path.name in found:
-                raise DataError(f"the same name as {found[path.name].path}", path=path)
-            found[path.name] = RelocalizationFile(path, source, target)
-    return sorted(found.values(), key=lambda file: (file.source, file.path.name))
+            if path.name in files:
+                raise DataError(f"the same name as {files[path.name].path}", path=path)
+            files[path.name] = RelocalizationFile(path, source, target)
+    return sorted(files.values(), key=lambda file: (file.source, file.path.name))
 
 
 # listed as missing if there is only a map recording

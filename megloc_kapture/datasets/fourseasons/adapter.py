@@ -126,8 +126,11 @@ class FourSeasons:
             calibration = recording.calibration(root)
             cars[recording.name] = query.add(recording, calibration, times)
             truth |= {(time, cars[recording.name]): pose for time, pose in known.items()}
-        tables = challenge_tables(chosen.files, chosen.recordings, local, mapping.data, query.data)
-        truth |= {(time, cars[name]): pose for (name, time), pose in tables.truth.items()}
+        pairs, priors, true_poses = challenge_tables(
+            chosen.files, chosen.recordings, local, mapping.data, query.data
+        )
+        truth |= {(time, cars[name]): pose for (name, time), pose in true_poses.items()}
+        lost = sum(len(file.rows) for file in chosen.files) - len(pairs)
         groups = _image_groups(chosen, mapping.data, query.data)
         truth_folder, truth_groups = read_ground_truth(root, query.data, frame.world())
         for image in groups.keys() & truth_groups.keys():
@@ -147,11 +150,11 @@ class FourSeasons:
             links={recording.name: recording.folder for recording in used},
             protocol=protocol_of(NAME).model_copy(update=rules),
             groups=groups,
-            priors=tables.priors,
-            relocalization=tables.pairs,
+            priors=priors,
+            relocalization=pairs,
             world=frame.world(),
             summary=_summary(chosen, poses, mapping.data, query.data, query_gt),
-            remarks=_remarks(poses, frame, tables, self.options.min_fusion_quality),
+            remarks=_remarks(poses, frame, lost, self.options.min_fusion_quality),
             missing=missing,
         )
 
@@ -279,7 +282,7 @@ def _summary(
 def _remarks(
     poses: Mapping[str, KeyframePoses],
     frame: LocalFrame,
-    tables: ChallengeTables,
+    lost: int,
     min_fusion_quality: int,
 ) -> list[str]:
     remarks = []
@@ -294,9 +297,9 @@ def _remarks(
             f"The map's poses are those of {POSES}, in a separate frame: only the query poses in "
             "relocalization files are known."
         )
-    if tables.lost:
+    if lost:
         remarks.append(
-            f"{tables.lost} pairs of relocalization files are left out: their reference has no "
+            f"{lost} pairs of relocalization files are left out: their reference has no "
             "pose or image, or their query no image. A challenge expects every pair."
         )
     return remarks
@@ -331,33 +334,15 @@ class ImageRecords:
             members[name + suffix] = cam_from_car
         for timestamp in times:
             for name, _ in zip(CAMERAS, cameras, strict=False):
-                record, image = (timestamp, name + suffix), recording.image(timestamp, name)
-                if record in self.data.records_camera:
-                    raise DataError(
-                        f"{self.data.records_camera[record]} has the same time",
-                        path=recording.image_file(timestamp, name),
-                    )
                 if self.missing.require(recording.image_file(timestamp, name)):
-                    self.data.records_camera[record] = image
+                    image = recording.image(timestamp, name)
+                    self.data.records_camera[timestamp, name + suffix] = image
         return car
 
 
 # a query may be matched with map images of this many keyframes before and after its reference
 NEIGHBOURS = 20
-
-
-@dataclass
-class ChallengeTables:
-    """The relocalization files in terms of imported images.
-
-    ``priors`` maps queries to permitted map images, ``truth`` maps (recording, timestamp) to
-    ``cam0_from_local``; ``lost`` counts pairs without pose or images.
-    """
-
-    pairs: list[RelocalizationPair] = field(default_factory=list)
-    priors: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    truth: dict[tuple[str, int], RigidTransform] = field(default_factory=dict)
-    lost: int = 0
+ImageKey = tuple[str, int]  # recording and timestamp of a query
 
 
 def challenge_tables(
@@ -366,11 +351,16 @@ def challenge_tables(
     cams_from_local: Mapping[str, Mapping[int, RigidTransform]],
     mapping: KaptureData,
     query: KaptureData,
-) -> ChallengeTables:
-    """Return the pairs, priors and true poses; ``cams_from_local`` is for left cameras."""
-    tables = ChallengeTables()
+) -> tuple[list[RelocalizationPair], dict[str, tuple[str, ...]], dict[ImageKey, RigidTransform]]:
+    """Express the relocalization files by imported images; ``cams_from_local`` of left cameras.
+
+    Return the pairs, the permitted map images of each query, and ``cam0_from_local`` by recording
+    and timestamp where it is known. Pairs without a reference pose or without images are left out.
+    """
+    pairs: list[RelocalizationPair] = []
+    truth: dict[ImageKey, RigidTransform] = {}
     map_images, query_images = set(mapping.image_names()), set(query.image_names())
-    around: dict[tuple[str, int], set[str]] = {}
+    around: dict[ImageKey, set[str]] = {}
     for file in files:
         source, target = recordings[file.source], recordings[file.target]
         poses = cams_from_local[source.name]
@@ -379,23 +369,23 @@ def challenge_tables(
         for row in file.rows:
             image = target.image(row.query, CAMERAS[0])
             if row.reference not in indices or image not in query_images:
-                tables.lost += 1
                 continue
             reference = source.image(row.reference, CAMERAS[0])
-            tables.pairs.append(RelocalizationPair(file.path.name, reference, image))
+            pairs.append(RelocalizationPair(file.path.name, reference, image))
             index = indices[row.reference]
             near = times[max(0, index - NEIGHBOURS) : index + NEIGHBOURS + 1]
             names = {source.image(t, camera) for t in near for camera in CAMERAS}
             around.setdefault((target.name, row.query), set()).update(names & map_images)
             if row.query_from_reference is not None:
                 pose = row.query_from_reference @ poses[row.reference]
-                tables.truth.setdefault((target.name, row.query), pose)
-    for (name, timestamp), permitted in around.items():
-        for camera in CAMERAS:
-            image = recordings[name].image(timestamp, camera)
-            if image in query_images:
-                tables.priors[image] = tuple(sorted(permitted))
-    return tables
+                truth.setdefault((target.name, row.query), pose)
+    priors = {
+        image: tuple(sorted(permitted))
+        for (name, timestamp), permitted in around.items()
+        for camera in CAMERAS
+        if (image := recordings[name].image(timestamp, camera)) in query_images
+    }
+    return pairs, priors, truth
 
 
 # ----------------------------------------------------------------------------------- poses
@@ -429,8 +419,6 @@ class LocalFrame:
         return cls(poses.earth_from_scene, (x, y, z))
 
     def cams_from_local(self, poses: KeyframePoses) -> dict[int, RigidTransform]:
-        if (poses.earth_from_scene is None) != (self.earth_from_scene is None):
-            raise ValueError("no way leads from one recording's scene to the other's")
         x, y, z = self.origin
         local_from_scene = RigidTransform((1.0, 0.0, 0.0, 0.0), (-x, -y, -z))
         if self.earth_from_scene is not None and poses.earth_from_scene is not None:
@@ -469,22 +457,20 @@ def read_keyframe_poses(
 
 def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
     path = recording.folder / GNSS_POSES
-    transformations = read_transformations(recording.folder / TRANSFORMATIONS)
-    scene_from_slam = transformations.w_from_gpsw.inverse() @ transformations.s_from_as
+    scene_from_slam, earth_from_scene, common_scale = read_transformations(
+        recording.folder / TRANSFORMATIONS
+    )
     poses: dict[int, RigidTransform] = {}
     dropped = []
-    for timestamp, row in sorted(read_gnss_poses(path).items()):
-        if row.fusion_quality is not None and row.fusion_quality < min_fusion_quality:
+    for timestamp, (slam_from_cam, scale, quality) in sorted(read_gnss_poses(path).items()):
+        if quality is not None and quality < min_fusion_quality:
             dropped.append(timestamp)
             continue
-        scale = transformations.gnss_scale if row.scale is None else row.scale
+        scale = common_scale if scale is None else scale
         if scale is None:
-            raise DataError(
-                "neither the pose nor Transformations.txt has a scale",
-                path=path,
-            )
-        x, y, z = (scale * value for value in row.slam_from_cam.translation)
-        metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))
+            raise DataError("neither the pose nor Transformations.txt has a scale", path=path)
+        x, y, z = (scale * value for value in slam_from_cam.translation)
+        metric = RigidTransform(slam_from_cam.quat_wxyz, (x, y, z))
         poses[timestamp] = scene_from_slam @ metric
     require(
         poses,
@@ -492,4 +478,4 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         "better; lower min_fusion_quality takes them",
         path=path,
     )
-    return KeyframePoses(poses, transformations.e_from_gpsw, dropped)
+    return KeyframePoses(poses, earth_from_scene, dropped)

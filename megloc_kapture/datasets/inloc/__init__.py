@@ -77,10 +77,10 @@ class Cutout:
 
 
 def parse_cutout_name(name: str) -> Cutout:
-    found = _CUTOUT.fullmatch(name)
-    if found is None or int(found[3]) >= 360 or abs(int(found[4])) > 90:
+    match = _CUTOUT.fullmatch(name)
+    if match is None or int(match[3]) >= 360 or abs(int(match[4])) > 90:
         raise DataError(f"{name!r} is not named <BUILDING>_cutout_<SCAN>_<YAW>_<PITCH>.jpg")
-    return Cutout(found[1], found[2], int(found[3]), int(found[4]))
+    return Cutout(match[1], match[2], int(match[3]), int(match[4]))
 
 
 def read_transformation(path: Path | str) -> RigidTransform:
@@ -104,8 +104,8 @@ def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.
     with reading(path, f"a MAT file with {POINTS}"):
         points = np.asarray(loadmat(path, variable_names=[POINTS])[POINTS], np.float64)
     if points.shape != (height, width, 3):
-        found = "x".join(map(str, points.shape))
-        raise DataError(f"{POINTS} is {found}, expected {height}x{width}x3", path=path)
+        shape = "x".join(map(str, points.shape))
+        raise DataError(f"{POINTS} is {shape}, expected {height}x{width}x3", path=path)
     return points
 
 
@@ -162,14 +162,15 @@ class Layout:
     def _scan(self, floor: str, number: str, missing: Missing) -> Scan:
         folder = self.cutouts / floor / number
         names = _listed(folder)
-        cutouts = [_cutout(folder, name) for name in names if name.endswith(".jpg")]
+        with named(folder):
+            cutouts = [parse_cutout_name(name) for name in names if name.endswith(".jpg")]
         building = cutouts[0].building if cutouts else _building(floor)
-        there = {cutout.image for cutout in cutouts}
+        images = {cutout.image for cutout in cutouts}
         points = {n.removesuffix(POINTS_SUFFIX) for n in names if n.endswith(POINTS_SUFFIX)}
         expected = {
             Cutout(building, number, yaw, pitch).image for yaw in YAWS_DEG for pitch in PITCHES_DEG
         }
-        missing.files += [folder / image for image in sorted((expected | points) - there)]
+        missing.files += [folder / image for image in sorted((expected | points) - images)]
         first = Cutout(building, number, 0, 0)
         transformation = self.alignment(floor) / "transformations" / first.transformation
         missing.require(transformation)
@@ -199,11 +200,6 @@ class Scan:
         return f"{self.floor}/{self.number}"
 
 
-def _cutout(folder: Path, name: str) -> Cutout:
-    with named(folder / name):
-        return parse_cutout_name(name)
-
-
 def _building(floor: str) -> str:
     return "cse" if floor in DISTRACTOR_FLOORS else "DUC"
 
@@ -213,7 +209,4 @@ def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _listed(folder: Path) -> list[str]:
-    try:
-        return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        raise DataError(f"cannot be listed: {error.strerror}", path=folder) from error
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))

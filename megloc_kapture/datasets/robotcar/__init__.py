@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -57,10 +57,10 @@ class ImageKey:
 
 def parse_image(text: str) -> ImageKey | None:
     """Parse an image name, with or without condition; return None for other names."""
-    found = _IMAGE.fullmatch(text.removeprefix("./"))
-    if found is None:
+    match = _IMAGE.fullmatch(text.removeprefix("./"))
+    if match is None:
         return None
-    return ImageKey(found["condition"] or "", found["camera"], found["stem"])
+    return ImageKey(match["condition"] or "", match["camera"], match["stem"])
 
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
@@ -135,16 +135,16 @@ class Layout:
 
     def individual_models(self) -> dict[str, Path]:
         return {
-            found[1]: folder
+            match[1]: folder
             for folder in sorted(self.individual_model("").parent.glob("*_aligned"))
-            if folder.is_dir() and (found := _MODEL.fullmatch(folder.name))
+            if folder.is_dir() and (match := _MODEL.fullmatch(folder.name))
         }
 
     def query_lists(self) -> dict[str, Path]:
         return {
-            found[1]: path
+            match[1]: path
             for path in sorted(self.query_list("").parent.glob("queries_location_*.txt"))
-            if (found := _QUERY_LIST.fullmatch(path.name))
+            if (match := _QUERY_LIST.fullmatch(path.name))
         }
 
     def is_merged(self, model: ModelChoice) -> bool:
@@ -216,11 +216,6 @@ def read_reference(
             nvm = read_nvm(layout.merged_model, with_points=False)
             for index, key in enumerate(_keys(nvm.names, layout.merged_model)):
                 poses[key] = nvm.cam_from_world(index)
-    path = layout.merged_model if merged else layout.individual_model("").parent
-    at_time: dict[tuple[str, int], ImageKey] = {}
-    for key in poses:
-        with named(path):
-            note_time(key, at_time)
     return Reference(poses, locations, merged)
 
 
@@ -275,8 +270,7 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     at_time: dict[tuple[str, int], ImageKey] = {}
     for location, path in lists.items():
         for image in read_query_location(path):
-            with named(path):
-                note_time(image, at_time)
+            at_time[image.camera, image.timestamp] = image
             others = locations.get(image, ())
             if location not in others:
                 locations[image] = (*others, location)
@@ -293,17 +287,13 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
             if known is not None:
                 train[known] = cam_from_world
     if version == 2 and missing.require(layout.test_list):
-        test, more = read_test_names(layout.test_list, at_time, train, allow_missing=allow_missing)
+        test, more = read_test_names(layout.test_list, at_time, allow_missing=allow_missing)
         unlisted += more
     return Queries(locations, train, test, unlisted)
 
 
 def read_test_names(
-    path: Path,
-    at_time: Mapping[tuple[str, int], ImageKey],
-    train: Collection[ImageKey],
-    *,
-    allow_missing: bool,
+    path: Path, at_time: Mapping[tuple[str, int], ImageKey], *, allow_missing: bool
 ) -> tuple[dict[ImageKey, str], int]:
     """Read version 2's test list: query -> its text in the list; count unknown entries."""
     test: dict[ImageKey, str] = {}
@@ -311,32 +301,18 @@ def read_test_names(
     for image, text in read_test_list(path).items():
         with named(path):
             known = _scored_query(image, at_time, allow_missing)
-            require(known not in train, f"{text!r} is a training image too")
         unlisted += known is None
         if known is not None:
             test[known] = text
     return test, unlisted
 
 
-def note_time(image: ImageKey, at_time: dict[tuple[str, int], ImageKey]) -> None:
-    """Register camera and time of an image; DataError if another image has both."""
-    if image.camera not in CAMERAS:
-        known = ", ".join(CAMERAS)
-        raise DataError(f"{image.path} is of camera {image.camera!r}; known: {known}")
-    other = at_time.setdefault((image.camera, image.timestamp), image)
-    require(other == image, f"{image.path} and {other.path} are of one camera and time")
-
-
 def _scored_query(
     image: ImageKey, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
 ) -> ImageKey | None:
-    require(
-        image.camera == SCORED_CAMERA,
-        f"{image.path}: an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only",
-    )
-    found = at_time.get((image.camera, image.timestamp))
-    if found is not None and image.condition in ("", found.condition):
-        return found
+    nearest = at_time.get((image.camera, image.timestamp))
+    if nearest is not None and image.condition in ("", nearest.condition):
+        return nearest
     if allow_missing:
         return None
     raise DataError(

@@ -18,7 +18,7 @@ from megloc_kapture.datasets.official import (
     OfficialDataset,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
+from megloc_kapture.datasets.reference_map import WITHOUT_DATABASE, check_model_files
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
@@ -31,7 +31,6 @@ from megloc_kapture.datasets.robotcar import (
     read_reference,
 )
 from megloc_kapture.datasets.robotcar.images import (
-    Car,
     Selection,
     car_of_kapture,
     mapping_data,
@@ -41,11 +40,14 @@ from megloc_kapture.datasets.robotcar.images import (
     read_kapture_images,
     reference_of_kapture,
     select,
+    with_images,
+    with_rig_of_model,
 )
 from megloc_kapture.errors import check_option
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
+from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Options
 
 # published counts, or counts of the published lists
@@ -143,18 +145,21 @@ class RobotCar:
         cameras = {camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))}
         find = image_finder(layout, missing)
         selection = select(version, reference, queries, cameras=cameras, find=find, **chosen)
-        model = None
+        model, remarks = dict[str, Any](), list[str]()
         if self.options.reference_model:
-            points = partial(_read_points, layout, selection)
-            model = ReferenceModel(points, layout.feature_database)
+            model["reference"] = partial(_read_points, layout, selection)
+            if layout.feature_database.is_file():
+                model["reference_database"] = layout.feature_database
+            else:
+                remarks.append(WITHOUT_DATABASE)
         return self._dataset(
             selection,
             read_car(layout, selection, missing),
             missing,
-            [] if model is None else model.remarks(),
+            remarks,
             reference_images=layout.num_reference_images(),
             links={"": layout.images},
-            reference=model,
+            **model,
         )
 
     def _read_kapture(
@@ -190,15 +195,15 @@ class RobotCar:
     def _dataset(
         self,
         selection: Selection,
-        car: Car,
+        car: KaptureData,
         missing: Missing,
         remarks: list[str],
         *,
         reference_images: int,
         **more: Any,
     ) -> OfficialDataset:
-        car = car.with_rig_of(selection.reference)
-        mapping, query = mapping_data(selection, car), car.data(selection.query_images)
+        car = with_rig_of_model(car, selection.reference)
+        mapping, query = mapping_data(selection, car), with_images(car, selection.query_images)
         published, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
         groups = _image_groups(selection)
         others = "test images" if selection.version == 2 else "other queries"
@@ -293,12 +298,12 @@ def _summary(selection: Selection, reference_images: int) -> list[Count]:
         Count("reference images with a pose", len(reference.poses), _NUM_REGISTERED),
         Count("query images", len(queries.locations), _NUM_QUERIES),
     ]
-    found = Counter((image.condition, image.camera) for image in queries.locations)
-    others = sorted({condition for condition, _ in found} - set(_QUERIES_PER_CAMERA))
+    counted = Counter((image.condition, image.camera) for image in queries.locations)
+    others = sorted({condition for condition, _ in counted} - set(_QUERIES_PER_CAMERA))
     for condition in (*_QUERIES_PER_CAMERA, *others):
         published = _QUERIES_PER_CAMERA.get(condition)
         for camera in CAMERAS:
-            counts.append(Count(f"  {condition}, {camera}", found[condition, camera], published))
+            counts.append(Count(f"  {condition}, {camera}", counted[condition, camera], published))
     if selection.version == 2:
         counts.append(Count("training images with a pose", len(queries.train), _NUM_TRAIN))
         counts.append(Count("test images", len(queries.test), _NUM_TEST))

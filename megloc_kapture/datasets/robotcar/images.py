@@ -17,7 +17,6 @@ from megloc_kapture.datasets.robotcar import (
     Layout,
     Queries,
     Reference,
-    note_time,
     parse_image,
     read_intrinsics,
     read_test_names,
@@ -93,40 +92,27 @@ def _of_moments(images: Iterable[ImageKey], others: Iterable[ImageKey]) -> list[
     return [image for image in images if (image.condition, image.timestamp) in moments]
 
 
-@dataclass(frozen=True, eq=False)
-class Car:
-    """The cameras by name, and their known ``sensor_from_rig``."""
+def with_rig_of_model(car: KaptureData, reference: Reference) -> KaptureData:
+    """Return the car with the rig estimated from the model's poses, if they suffice."""
+    members = rig_of_model(reference.poses)
+    fits = members and set(members) <= set(car.sensors)
+    return replace(car, rigs={RIG_ID: members}) if fits else car
 
-    sensors: Mapping[str, Sensor]
-    members: Mapping[str, RigidTransform]
 
-    def with_rig_of(self, reference: Reference) -> Car:
-        """Return the car with the rig estimated from the model's poses, if they suffice."""
-        of_model = rig_of_model(reference.poses)
-        return (
-            replace(self, members=of_model)
-            if of_model and set(of_model) <= set(self.sensors)
-            else self
-        )
-
-    def data(self, images: Mapping[ImageKey, str]) -> KaptureData:
-        return KaptureData(
-            sensors=dict(self.sensors),
-            rigs={RIG_ID: dict(self.members)} if self.members else {},
-            records_camera={_record(image): path for image, path in images.items()},
-        )
+def with_images(car: KaptureData, images: Mapping[ImageKey, str]) -> KaptureData:
+    return replace(car, records_camera={_record(image): path for image, path in images.items()})
 
 
 def _record(image: ImageKey) -> tuple[int, str]:
     return image.timestamp, image.camera
 
 
-def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
+def read_car(layout: Layout, selection: Selection, missing: Missing) -> KaptureData:
     """Read intrinsics and extrinsics; image sizes come from one image per camera."""
     images = {**selection.map_images, **selection.train_images, **selection.query_images}
     example = {image.camera: path for image, path in reversed(images.items())}
-    sensors = {}
-    members = {}
+    sensors: dict[str, Sensor] = {}
+    members: dict[str, RigidTransform] = {}
     for camera in CAMERAS:
         path = layout.intrinsics(camera)
         if path.exists():
@@ -139,14 +125,14 @@ def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
         path = layout.extrinsics(camera)
         if missing.require(path) and camera in sensors:
             members[camera] = read_transform(path).inverse()  # car_from_cam, metres
-    return Car(sensors, members)
+    return KaptureData(sensors, {RIG_ID: members} if members else {})
 
 
-def mapping_data(selection: Selection, car: Car) -> KaptureData:
+def mapping_data(selection: Selection, car: KaptureData) -> KaptureData:
     """Return the map's images; each has a separate pose, as no rig fits exactly."""
     images = {**selection.map_images, **selection.train_images}
     poses = {**selection.reference.poses, **selection.queries.train}
-    return with_poses(car.data(images), {_record(image): poses[image] for image in images})
+    return with_poses(with_images(car, images), {_record(image): poses[image] for image in images})
 
 
 def query_truth(
@@ -203,32 +189,30 @@ def middle_transform(transforms: Sequence[RigidTransform]) -> RigidTransform:
 
 
 def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, KaptureImage]:
-    found: dict[ImageKey, KaptureImage] = {}
+    by_key: dict[ImageKey, KaptureImage] = {}
     cameras: dict[str, Camera] = {}
-    at_time: dict[tuple[str, int], ImageKey] = {}
     for image in form.read(missing):
         key = parse_image(image.name)
         if key is None or not key.condition:
             raise DataError(
                 f"image {image.name!r}; expected condition/camera/time.jpg", path=image.file
             )
-        with named(image.file):
-            note_time(key, at_time)
         require(
             cameras.setdefault(key.camera, image.camera) == image.camera,
             f"camera {key.camera} is not that of other images; all of RobotCar's images are "
             "rectified to one for each side",
             path=image.file,
         )
-        found[key] = image
-    return found
+        by_key[key] = image
+    return by_key
 
 
-def car_of_kapture(form: KaptureForm, images: Mapping[ImageKey, KaptureImage]) -> Car:
+def car_of_kapture(form: KaptureForm, images: Mapping[ImageKey, KaptureImage]) -> KaptureData:
     cameras = {key.camera: image.camera for key, image in images.items()}
     names = {image.sensor_id: key.camera for key, image in images.items()}
     sensors = {name: Sensor.from_camera(cameras[name], name=name) for name in sorted(cameras)}
-    return Car(sensors, {names[one]: pose for one, pose in form.rig().items() if one in names})
+    members = {names[sensor]: pose for sensor, pose in form.rig().items() if sensor in names}
+    return KaptureData(sensors, {RIG_ID: members} if members else {})
 
 
 def reference_of_kapture(images: Mapping[ImageKey, KaptureImage]) -> Reference:
@@ -263,7 +247,7 @@ def queries_of_kapture(
     unlisted = 0
     if version == 2 and test_list.is_file():
         at_time = {(key.camera, key.timestamp): key for key in keys}
-        test, unlisted = read_test_names(test_list, at_time, train, allow_missing=allow_missing)
+        test, unlisted = read_test_names(test_list, at_time, allow_missing=allow_missing)
     elif version == 2:
         test = {key: f"{key.camera}/{key.stem}.png" for key in poses if key not in train}
     return version, Queries({key: images[key].locations for key in keys}, train, test, unlisted)

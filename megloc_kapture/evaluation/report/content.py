@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,10 +65,6 @@ def format_median(position_m: float, angle_deg: float) -> str:
     if not math.isfinite(position_m):
         return "inf"
     return f"{format_metres(position_m)}, {format_degrees(angle_deg)}"
-
-
-def format_interval(at: RecallAt) -> str:
-    return f"{format_percent(at.low)}-{format_percent(at.high)}"
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
@@ -146,11 +142,6 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
             f"{confidence.num_nowhere - confidence.num_nowhere_refused} given a pose"
         )
     return sentences
-
-
-def covariance_sentence(check: Mapping[str, int]) -> str:
-    errors = counted(check["num_poses"], "error lies", "errors lie")
-    return f"{check['num_within']} of {errors} within the claimed 95 % region"
 
 
 def consistency_sentence(row: ConsistencyRow) -> str:
@@ -267,7 +258,11 @@ def recall_table(evaluations: Sequence[Evaluation]) -> DataFrame:
 def interval_table(evaluations: Sequence[Evaluation]) -> DataFrame:
     """Return the confidence intervals of recall, one column per threshold."""
     return _frame(
-        {**label, **{str(at.threshold): format_interval(at) for at in row.recall}}
+        label
+        | {
+            str(at.threshold): f"{format_percent(at.low)}-{format_percent(at.high)}"
+            for at in row.recall
+        }
         for label, row in _rows(evaluations)
     )
 

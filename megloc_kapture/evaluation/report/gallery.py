@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -34,13 +33,8 @@ _MAX_ERROR_PX = 8.0
 AGREES, DISAGREES, UNKNOWN = "#12a150", "#e02424", "#f2b705"
 
 
-@dataclass(frozen=True)
-class Picture:
-    """An ``<img>`` or ``<svg>`` element with its name and facts."""
-
-    name: str
-    facts: str
-    element: Markup
+# name, facts, and an ``<img>`` or ``<svg>`` element
+Picture = tuple[str, str, Markup]
 
 
 def worst_pictures(
@@ -110,7 +104,7 @@ def _draw_pair(
         best = min(map_poses, key=lambda i: float(np.linalg.norm(map_poses[i].center() - center)))
     facts = query_facts(query)
     if context.mapping is None or not best:
-        return Picture(query.name, ", ".join(facts), image_tag(left, query.image))
+        return query.name, ", ".join(facts), image_tag(left, query.image)
     right, right_scale = _read(context.mapping, best)
     query_px, map_px = matches.get(best, (np.zeros((0, 2)), np.zeros((0, 2))))
     facts.append(f"right: {best}, {counted(len(query_px), 'match', 'matches')}")
@@ -126,7 +120,7 @@ def _draw_pair(
     drawn = spread(len(query_px), _MAX_LINES)
     points = query_px[drawn] * scale, map_px[drawn] * right_scale
     element = side_by_side(left, right, points, colors[drawn].tolist(), query.image)
-    return Picture(query.name, ", ".join(facts), element)
+    return query.name, ", ".join(facts), element
 
 
 def fits_poses(

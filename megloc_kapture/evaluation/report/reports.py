@@ -88,7 +88,10 @@ def report_text(reported: Reported) -> str:
     has_label = isinstance(reported, Evaluation) and reported.label
     parts = [reported.evaluations[0].label] if has_label else []
     for text, table in _facts(reported):
-        lines = [_wrapped(line) for line in text.splitlines()]
+        lines = [
+            fill(line, _WIDTH, break_long_words=False, break_on_hyphens=False)
+            for line in text.splitlines()
+        ]
         parts.append("\n".join(lines if table is None else [*lines, content.as_text(table)]))
     return "\n\n".join(parts) + "\n"
 
@@ -116,9 +119,10 @@ def _facts(reported: Reported) -> list[_Fact]:
         if (confidence := evaluation.confidence) is not None:
             sentences = content.confidence_sentences(confidence, thresholds[-1])
             facts.append((f"Confidence{whose}: {'; '.join(sentences)}.", None))
-        if evaluation.covariance is not None:
-            sentence = content.covariance_sentence(evaluation.covariance)
-            facts.append((f"Covariance{whose}: {sentence}.", None))
+        if (check := evaluation.covariance) is not None:
+            errors = content.counted(check["num_poses"], "error lies", "errors lie")
+            sentence = f"{check['num_within']} of {errors} within the claimed 95 % region."
+            facts.append((f"Covariance{whose}: {sentence}", None))
     if isinstance(reported, Comparison):
         sentences = content.comparison_sentences(reported)
         facts += [("\n".join(sentences), None), (content.method_sentence(reported), None)]
@@ -140,10 +144,6 @@ def _facts_without_truth(reported: WithoutTruth) -> list[_Fact]:
         facts.append((heading, content.agreement_table(reported, rows)))
         facts.append((content.agreement_sentence(rows[-1], reported), None))
     return facts
-
-
-def _wrapped(text: str) -> str:
-    return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def report_data(reported: Reported) -> dict[str, Any]:

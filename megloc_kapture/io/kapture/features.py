@@ -49,7 +49,6 @@ DTYPES: dict[str, np.dtype[Any]] = {
     name: np.dtype(code)
     for name, code in (("float32", "<f4"), ("float64", "<f8"), ("int32", "<i4"), ("uint8", "u1"))
 }
-_ROWS_AT_ONCE = 256  # a chunk fits the processor's cache
 _ROUNDING = 4e-7  # rows whose squared length is one up to this stay unchanged
 
 
@@ -101,15 +100,15 @@ def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
     if (parent / f"{kind}.txt").is_file():
         message = "features of kapture 1.0 without a type: upgrade with kapture_upgrade_1_0_to_1_1"
         raise DataError(message, path=parent)
-    found = []
+    types = []
     with reading(parent):
         names = sorted(entry.name for entry in parent.iterdir() if not entry.name.startswith("."))
     for name in names:
         folder = parent / name / kind if orphan else parent / name
         if folder.is_dir() if kind == "matches" else (folder / f"{kind}.txt").is_file():
             with named(parent):
-                found.append(check_component(name))
-    return found
+                types.append(check_component(name))
+    return types
 
 
 def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
@@ -145,12 +144,12 @@ class FolderBlobs:
         self._folder, self._suffix = folder, suffix
 
     def names(self) -> list[str]:
-        found = []
+        names = []
         for folder, _, files in os.walk(self._folder):
             below = folder[len(str(self._folder)) :].lstrip("/")
             prefix = f"{below}/" if below else ""
-            found += [prefix + name for name in files if name.endswith(self._suffix)]
-        return sorted(found)
+            names += [prefix + name for name in files if name.endswith(self._suffix)]
+        return sorted(names)
 
     def __contains__(self, name: str) -> bool:
         try:
@@ -326,27 +325,17 @@ class KaptureVectors:
     def dimension(self) -> int:
         return self._reader.config.dsize
 
-    def read(
-        self, start: int, stop: int, out: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Read unit rows of the images ``start`` to ``stop``, (stop - start, D), into ``out``."""
+    def read(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Read unit rows of the images ``start`` to ``stop``, (stop - start, D)."""
         images = self._images[start:stop]
-        rows = np.empty((len(images), self.dimension), np.float32) if out is None else out
-        for begin in range(0, len(images), _ROWS_AT_ONCE):
-            chunk = rows[begin : begin + _ROWS_AT_ONCE]
-            some = images[begin : begin + _ROWS_AT_ONCE]
-            with np.errstate(over="ignore"):  # overflow of float32 is refused below
-                for row, image in zip(chunk, some, strict=True):
-                    row[:] = self._reader.read_unchecked(image)
-            with np.errstate(over="ignore", invalid="ignore"):
-                squared = np.vecdot(chunk, chunk).astype(np.float64)
-            for k in np.flatnonzero(~((squared > 1e-24) & (squared < 1e30))).tolist():
-                squared[k] = np.square(chunk[k], dtype=np.float64).sum()
-                if not np.isfinite(squared[k]):
-                    raise DataError("not all values are finite", path=self._reader.where(some[k]))
-            scaled = np.flatnonzero((squared > 0) & (np.abs(squared - 1) > _ROUNDING))
-            if len(scaled):
-                chunk[scaled] /= np.sqrt(squared[scaled])[:, None]
+        rows = np.empty((len(images), self.dimension), np.float32)
+        for row, image in zip(rows, images, strict=True):
+            row[:] = self._reader.read_unchecked(image)
+        squared = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)
+        for at in np.flatnonzero(~np.isfinite(squared))[:1].tolist():
+            raise DataError("not all values are finite", path=self._reader.where(images[at]))
+        scaled = np.flatnonzero((squared > 0) & (np.abs(squared - 1) > _ROUNDING))
+        rows[scaled] /= np.sqrt(squared[scaled])[:, None]
         return rows
 
 

@@ -54,7 +54,7 @@ class KaptureFolder:
                 continue
             for kind in _ARRAY_KINDS:
                 for type_name in sorted(set(self.types(kind)) & set(other.types(kind))):
-                    mine, theirs = (one._features(kind, type_name) for one in (self, other))
+                    mine, theirs = (folder._features(kind, type_name) for folder in (self, other))
                     if image in mine and image in theirs and _same_array(mine, theirs, image):
                         raise DataError(
                             f"{image} is another image in {self.root} than in {other.root}, and "
@@ -77,10 +77,10 @@ class KaptureFolder:
         return self.image_path(name)
 
     def types(self, kind: FeatureKind) -> list[str]:
-        found = set(list_types(self.root, kind, orphan=False))
+        types = set(list_types(self.root, kind, orphan=False))
         for folder in self.features_dirs:
-            found.update(list_types(folder, kind, orphan=True))
-        return sorted(found)
+            types.update(list_types(folder, kind, orphan=True))
+        return sorted(types)
 
     def keypoints(self, type_name: str) -> FeatureReader:
         return self._features("keypoints", type_name)
@@ -109,9 +109,9 @@ class KaptureFolder:
         """Return the observations of the 3D points by keypoints type; cached, read-only."""
         if self._observations is None:
             path = self._observations_path
-            found = read_observations(path)
+            by_type = read_observations(path)
             num_points = len(self.points3d())
-            for observations in found.values():
+            for observations in by_type.values():
                 self._check_observations(observations, num_points, path)
                 for array in (
                     observations.point_ids,
@@ -119,7 +119,7 @@ class KaptureFolder:
                     observations.keypoint_ids,
                 ):
                     array.setflags(write=False)
-            self._observations = found
+            self._observations = by_type
         return dict(self._observations)
 
     def validate(self, *, deep: bool = False) -> None:
@@ -153,16 +153,16 @@ class KaptureFolder:
 
     def _folders(self, kind: FeatureKind, type_name: str) -> list[Path]:
         candidates = [(self.root, False), *((folder, True) for folder in self.features_dirs)]
-        found = [
+        folders = [
             feature_folder(root, kind, type_name, orphan=orphan)
             for root, orphan in candidates
             if type_name in list_types(root, kind, orphan=orphan)
         ]
-        if not found:
+        if not folders:
             searched = ", ".join(str(root) for root, _ in candidates)
             present = ", ".join(self.types(kind)) or "none"
             raise DataError(f"no {kind} of type {type_name!r} in {searched}; there are: {present}")
-        return found
+        return folders
 
     def _check_descriptors(
         self, descriptors: FeatureReader, keypoints_by_type: dict[str, FeatureReader]

@@ -163,11 +163,11 @@ def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterato
 
 
 def check_version(path: Path, first_line: str, *, required: bool) -> None:
-    found = _VERSION_PATTERN.search(first_line)
-    if found is None:
+    match = _VERSION_PATTERN.search(first_line)
+    if match is None:
         require(not required, f"the first line must be '{FORMAT_LINE}'", path=path, line=1)
-    elif found[1] not in _READ_VERSIONS:
-        message = f"kapture format {found[1]} is not supported; convert it to {FORMAT_VERSION}"
+    elif match[1] not in _READ_VERSIONS:
+        message = f"kapture format {match[1]} is not supported; convert it to {FORMAT_VERSION}"
         raise DataError(message, path=path, line=1)
 
 

@@ -48,14 +48,14 @@ class MatchesReader:
     @property
     def pairs(self) -> list[tuple[str, str]]:
         if self._pairs is None:
-            found = set()
+            pairs = set()
             for source in self._sources:
                 for name in source.names():
                     parts = name.removesuffix(SUFFIX["matches"]).split(_BETWEEN)
                     if len(parts) != 2 or parts[0] == parts[1]:
                         raise DataError("does not name a pair of images", path=source.where(name))
-                    found.add((min(parts), max(parts)))
-            self._pairs = sorted(found)
+                    pairs.add((min(parts), max(parts)))
+            self._pairs = sorted(pairs)
         return list(self._pairs)
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
@@ -63,15 +63,15 @@ class MatchesReader:
 
     def length(self, a: str, b: str) -> int:
         """Return the number of matches of a pair from its file size; 0 without a file."""
-        found = self._find(a, b)
-        return 0 if found is None else found[0].size(found[1]) // _ROW_BYTES
+        entry = self._find(a, b)
+        return 0 if entry is None else entry[0].size(entry[1]) // _ROW_BYTES
 
     def read(self, a: str, b: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Read the indices int64 (M, 2) into ``a`` and ``b`` and scores float64 (M,) of a pair."""
-        found = self._find(a, b)
-        if found is None:
+        entry = self._find(a, b)
+        if entry is None:
             raise DataError(f"no matches of type {self.type_name!r} for {a!r} and {b!r}")
-        source, name, swapped = found
+        source, name, swapped = entry
         content = source.read(name)
         if len(content) % _ROW_BYTES:
             raise DataError(

@@ -120,21 +120,21 @@ def read_observations(path: Path) -> dict[str, Observations]:
         np.concatenate(ids) for ids in zip(*blocks, strict=True)
     )
     names = np.array(list(images))
-    found = {}
+    by_type = {}
     for keypoints_type, type_id in sorted(types.items()):
         rows = slice(None) if len(types) == 1 else type_ids == type_id
         used = np.flatnonzero(np.bincount(image_ids[rows], minlength=len(names)))
         used = used[np.argsort(names[used])]
         rank = np.empty(len(names), np.int32)
         rank[used] = np.arange(len(used))
-        found[keypoints_type] = Observations(
+        by_type[keypoints_type] = Observations(
             keypoints_type,
             tuple(names[used].tolist()),
             points[rows],
             rank[image_ids[rows]],
             keypoints[rows],
         ).sorted_by_point()
-    return found
+    return by_type
 
 
 def _numbers() -> defaultdict[str, int]:

@@ -192,9 +192,19 @@ def unit_quaternion(
 def write_sensors(root: Path, data: KaptureData) -> None:
     """Write the tables of the kapture at ``root``, sorted, and remove old files of empty tables."""
     tables = {
-        "sensors": _sensor_rows(data),
-        "rigs": _rig_rows(data),
-        "trajectories": _trajectory_rows(data),
+        "sensors": [
+            [sensor_id, sensor.name, sensor.sensor_type, *sensor.params]
+            for sensor_id, sensor in sorted(data.sensors.items())
+        ],
+        "rigs": [
+            [rig_id, sensor_id, *_pose_fields(pose)]
+            for rig_id, members in sorted(data.rigs.items())
+            for sensor_id, pose in sorted(members.items())
+        ],
+        "trajectories": [
+            [str(int(time)), device, *_pose_fields(pose)]
+            for (time, device), pose in sorted(data.trajectories.items())
+        ],
         "records_camera": _record_rows(data.records_camera),
         "records_depth": _record_rows(data.records_depth),
     }
@@ -204,28 +214,6 @@ def write_sensors(root: Path, data: KaptureData) -> None:
             write_bytes(path, format_table(_HEADERS[name], rows))
         else:
             remove(path)
-
-
-def _sensor_rows(data: KaptureData) -> list[list[str]]:
-    return [
-        [sensor_id, sensor.name, sensor.sensor_type, *sensor.params]
-        for sensor_id, sensor in sorted(data.sensors.items())
-    ]
-
-
-def _rig_rows(data: KaptureData) -> list[list[str]]:
-    return [
-        [rig_id, sensor_id, *_pose_fields(pose)]
-        for rig_id, members in sorted(data.rigs.items())
-        for sensor_id, pose in sorted(members.items())
-    ]
-
-
-def _trajectory_rows(data: KaptureData) -> list[list[str]]:
-    return [
-        [str(int(time)), device, *_pose_fields(pose)]
-        for (time, device), pose in sorted(data.trajectories.items())
-    ]
 
 
 def _record_rows(records: dict[tuple[int, str], str]) -> list[list[str]]:

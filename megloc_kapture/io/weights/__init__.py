@@ -111,7 +111,7 @@ def lookup(name: str) -> Weights:
 
 
 def by_sha256(sha256: str) -> tuple[Weights, PublishedFile] | None:
-    return next((found for found in _all_files() if found[1].sha256 == sha256), None)
+    return next((entry for entry in _all_files() if entry[1].sha256 == sha256), None)
 
 
 def by_file_name(name: str) -> tuple[Weights, PublishedFile] | None:
@@ -191,15 +191,15 @@ def find_weights(name: str) -> WeightsFile:
 
 def find_all_weights(names: Sequence[str]) -> list[WeightsFile]:
     """Find several checkpoints; one MissingWeightsError names all missing ones."""
-    found, missing = [], []
+    files, missing = [], []
     for name in names:
         try:
-            found.append(find_weights(name))
+            files.append(find_weights(name))
         except MissingWeightsError as error:
             missing.append(error)
     if missing:
         raise all_missing(missing)
-    return found
+    return files
 
 
 def all_missing(errors: Iterable[MissingWeightsError]) -> MissingWeightsError:
@@ -230,10 +230,9 @@ def how_to_get(weights: Weights) -> str:
     """Return a one-line message: the missing checkpoint and how to get it."""
     names = " or ".join(file.name for file in weights.files)
     fetch = f"megloc weights fetch {weights.name}"
-    if found := to_convert(weights):
-        return (
-            f"the weights {weights.name} must be converted once: {how_to_convert(weights, found)}"
-        )
+    if original := to_convert(weights):
+        convert = how_to_convert(weights, original)
+        return f"the weights {weights.name} must be converted once: {convert}"
     if weights.to_fetch is None:
         then = "megloc weights add FILE"
         if all(file.convert for file in weights.files):
@@ -309,13 +308,13 @@ def _load_torch(path: Path, mapped: bool) -> Any:
         return torch.load(path, weights_only=True, map_location="cpu", mmap=mapped)
 
 
-def _state_dict(found: Any, path: Path) -> dict[str, torch.Tensor]:
+def _state_dict(content: Any, path: Path) -> dict[str, torch.Tensor]:
     import torch
 
     for key in _STATE_KEYS:
-        if isinstance(found, Mapping) and isinstance(found.get(key), Mapping):
-            found = found[key]
-    items = found.items() if isinstance(found, Mapping) else ()
+        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+            content = content[key]
+    items = content.items() if isinstance(content, Mapping) else ()
     tensors = {
         str(key).removeprefix("module."): value.detach()
         for key, value in items
@@ -372,15 +371,15 @@ def add_weights(
     An ``unverified`` file may differ from the published one, and is used where that is missing.
     """
     require(source.is_file(), "no such file", path=source)
-    found = describe(source.name, source)
-    sha256 = sha256_of(found)
+    described = describe(source.name, source)
+    sha256 = sha256_of(described)
     weights, target = _recognised(source, sha256, name)
     expected = next((f for f in weights.files if f.name == target), None)
     if expected is not None and expected.convert:
         command = how_to_convert(weights, source)
         raise DataError(f"is not read as it is; convert it once: {command}", path=source)
-    check_sha256(found, None if unverified else expected)
-    read_weights(found)
+    check_sha256(described, None if unverified else expected)
+    read_weights(described)
     path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
     if path.exists() and not force:
         if sha256_of(describe(weights.name, path)) == sha256:
@@ -410,9 +409,9 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
 
 def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, str]:
     if name is None:
-        found = by_sha256(sha256) or by_file_name(source.name)
-        if found is not None:
-            return found[0], found[1].name
+        entry = by_sha256(sha256) or by_file_name(source.name)
+        if entry is not None:
+            return entry[0], entry[1].name
         if source.suffix == ".safetensors" and source.stem in registry():
             return registry()[source.stem], source.name
         raise OptionError(

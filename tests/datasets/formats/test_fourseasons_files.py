@@ -71,23 +71,27 @@ def test_gnss_poses(
 ) -> None:
     rows = read_gnss_poses(write(text))
     assert list(rows) == [TIME]  # to the last digit
-    row = rows[TIME]
-    assert (row.scale, row.fusion_quality) == (scale, quality)
-    assert row.slam_from_cam.translation == (-0.06, 0.05, -0.15)
+    slam_from_cam, *numbers = rows[TIME]
+    assert numbers == [scale, quality]
+    assert slam_from_cam.translation == (-0.06, 0.05, -0.15)
     rotation = Rotation.from_quat([-0.015376, 0.724499, -0.689104, -0.000977]).as_matrix()
-    np.testing.assert_allclose(row.slam_from_cam.rotation_matrix(), rotation, atol=1e-14)
-    assert read_poses(write(f"# ts\n{PLAIN}\n")) == {TIME: row.slam_from_cam}
+    np.testing.assert_allclose(slam_from_cam.rotation_matrix(), rotation, atol=1e-14)
+    assert read_poses(write(f"# ts\n{PLAIN}\n")) == {TIME: slam_from_cam}
 
 
 @pytest.mark.parametrize("between", ["\n", ""])
 @pytest.mark.parametrize("order", [1, -1])
 def test_transformations(write: Callable[[str], Path], between: str, order: int) -> None:
-    found = read_transformations(write(between.join(BLOCKS[::order])))
-    assert found.s_from_as.translation == (1.0, 2.0, 3.0)
-    assert found.w_from_gpsw == RigidTransform((0.8, 0.0, 0.0, 0.6), (4.0, 5.0, 6.0))
-    assert found.e_from_gpsw == RigidTransform((0.8, 0.6, 0.0, 0.0), (4e6, 8e5, 4.7e6))
-    assert found.gnss_scale == 0.9624
-    assert read_transformations(write("".join(BLOCKS[:5]))).gnss_scale is None
+    scene_from_slam, earth_from_scene, scale = read_transformations(
+        write(between.join(BLOCKS[::order]))
+    )
+    world_from_scene = RigidTransform((0.8, 0.0, 0.0, 0.6), (4.0, 5.0, 6.0))
+    world_from_slam = world_from_scene @ scene_from_slam
+    np.testing.assert_allclose(world_from_slam.translation, (1.0, 2.0, 3.0), atol=1e-12)
+    np.testing.assert_allclose(world_from_slam.rotation_matrix(), np.eye(3), atol=1e-12)
+    assert earth_from_scene == RigidTransform((0.8, 0.6, 0.0, 0.0), (4e6, 8e5, 4.7e6))
+    assert scale == 0.9624
+    assert read_transformations(write("".join(BLOCKS[:5])))[2] is None
 
 
 @pytest.mark.parametrize(

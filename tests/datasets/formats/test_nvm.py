@@ -202,14 +202,14 @@ def test_what_is_written_comes_back_exactly_and_kapture_reads_it(tmp_path: Path)
 @pytest.mark.parametrize(
     ("lines", "match"),
     [
-        (["2", CAMERA, TURNED, "1", "1 2 3 4 5"], "broken points from '1 2 3 4 5"),
+        (["2", CAMERA, TURNED, "1", "1 2 3 4 5"], "m.nvm: not an NVM file, or broken"),
         (["2", CAMERA, TURNED, "1", "1 2 3 4 5 6 1 2 0 1 2"], "unknown image"),
         (["2", CAMERA, TURNED, "9", *POINTS], "the file ends before its last point"),
-        (["2", CAMERA], "the file ends after 1 of 2 cameras"),
-        (["2", CAMERA, CAMERA, "0"], "camera 'db/7.jpg': .*each image once"),
-        (["1", CAMERA.replace("2.0", "nan"), "0"], "camera 'db/7.jpg': expected 10 finite"),
+        (["2", CAMERA], "1 of 2 cameras"),
+        (["2", CAMERA, CAMERA, "0"], "1 of 2 cameras, each image once"),
+        (["1", CAMERA.replace("2.0", "nan"), "0"], "not all cameras are finite"),
         (["1", CAMERA.replace("db", ".."), "0"], "camera '../7.jpg': .*leads out"),
-        (["1", CAMERA], "expected the number of points, got ''"),
+        (["1", CAMERA], "not an NVM file, or broken"),
         (["1", CAMERA, "0", "1", TURNED, "1", POINTS[2]], "several models"),
     ],
 )

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scored import evaluate_poses
+from scored import evaluate_poses, write_kapture
 
 from megloc_kapture.evaluation.report.gallery import (
     AGREES,
@@ -48,14 +47,14 @@ class Run:
 
 
 @pytest.fixture
-def run(tmp_path: Path, kaptures: Callable[..., Path]) -> Run:
+def run(tmp_path: Path) -> Run:
     rng = np.random.default_rng(0)
     workspace = tmp_path / "workspace"
     write_protocol(workspace / "megloc", Protocol())
     map_poses = {name: POSES[name] for name in (NEAR, FAR)}
-    kaptures(workspace / "mapping", list(map_poses), map_poses, CAMERA)
-    kaptures(workspace / "query", [QUERY, "query/other.jpg"], {}, CAMERA)
-    kaptures(workspace / "localized", [QUERY, "query/other.jpg"], {}, CAMERA)
+    write_kapture(workspace / "mapping", list(map_poses), map_poses, CAMERA)
+    write_kapture(workspace / "query", [QUERY, "query/other.jpg"], {}, CAMERA)
+    write_kapture(workspace / "localized", [QUERY, "query/other.jpg"], {}, CAMERA)
     for folder, names in (("mapping", map_poses), ("query", [QUERY])):
         for name in names:
             pixels = rng.integers(0, 256, (480, 640, 3), dtype=np.uint8)
@@ -86,7 +85,7 @@ def shown() -> QueryResult:
     return query
 
 
-def test_projections_of_one_point_fit_and_others_do_not(run: Run) -> None:
+def test_matches_that_fit_poses(run: Run) -> None:
     map_from_query = POSES[NEAR] @ POSES[QUERY].inverse()
     matches = run.query_px, run.map_px, CAMERA, CAMERA
     fits = fits_poses(*matches, map_from_query)
@@ -100,10 +99,9 @@ def test_projections_of_one_point_fit_and_others_do_not(run: Run) -> None:
 
 def test_the_best_match_is_shown_next_to_the_query(run: Run, shown: QueryResult) -> None:
     map_poses = run.context.map_poses()
-    (picture,) = worst_pictures([shown], run.context, map_poses)
+    ((_, facts, element),) = worst_pictures([shown], run.context, map_poses)
     # ranked second, but with more matches
-    assert f"right: {NEAR}, 42 matches, 30 of them agree with the true pose" in picture.facts
-    element = str(picture.element)
+    assert f"right: {NEAR}, 42 matches, 30 of them agree with the true pose" in facts
     assert element.count("<image ") == 2
     assert element.count(f'stroke="{AGREES}"') == element.count(f'stroke="{DISAGREES}"') == 1
     # lines join the matched pixels
@@ -111,8 +109,8 @@ def test_the_best_match_is_shown_next_to_the_query(run: Run, shown: QueryResult)
     x1, y1 = run.map_px[0] * 400 / 640 + np.array([400 + 6, 0.0])
     assert f"M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" in element
     # without candidates the map image nearest to the pose is shown
-    (picture,) = worst_pictures([replace(shown, candidates=())], run.context, map_poses)
-    assert f"right: {NEAR}, 0 matches" in picture.facts
+    ((_, facts, _),) = worst_pictures([replace(shown, candidates=())], run.context, map_poses)
+    assert f"right: {NEAR}, 0 matches" in facts
 
 
 def test_missing_data_are_left_out(run: Run, shown: QueryResult) -> None:

@@ -33,7 +33,7 @@ def turned(world: Any, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_any_axis_may_be_up_and_the_page_is_not_mirrored(world: Any, axis: int, sign: int) -> None:
+def test_top_view_along_any_axis_is_not_mirrored(world: Any, axis: int, sign: int) -> None:
     up = np.zeros(3)
     up[axis] = sign
     rotation = Rotation.align_vectors(up[None], np.array([[0.0, 0, 1]]))[0].as_matrix()
@@ -42,7 +42,7 @@ def test_any_axis_may_be_up_and_the_page_is_not_mirrored(world: Any, axis: int, 
     assert set(labels) == set("xyz") - {"xyz"[axis]}
 
 
-def test_a_slanted_world_is_seen_along_its_vertical(world: Any) -> None:
+def test_top_view_of_a_slanted_world(world: Any) -> None:
     level, labels = top_view(*arrays(world.truth.values()))
     assert labels == ("x", "y")
     np.testing.assert_array_equal(np.array([[1.0, 2.0, 3.0]]) @ level.T, [[1.0, 2.0]])
@@ -59,7 +59,7 @@ def test_a_slanted_world_is_seen_along_its_vertical(world: Any) -> None:
     )
 
 
-def test_frames_are_drawn_apart() -> None:
+def test_frames_have_separate_figures() -> None:
     mapped = {f"DUC1/{i}.jpg": moved(i) for i in range(5)}
     mapped |= {f"DUC2/{i}.jpg": moved(1000.0 + i) for i in range(5)}
     frames = {name: name[:4] for name in mapped}

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scored import evaluate_poses
+from scored import Page, displaced, evaluate_poses, make_world
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.evaluation.comparison import compare
@@ -39,7 +38,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_names_are_escaped(world: Any, page_of: Any) -> None:
+def test_names_are_escaped(world: Any) -> None:
     evil = '"><script>alert(1)</script>'
     name = f"query/{evil}.jpg"
     world.truth[name] = HERE
@@ -48,29 +47,29 @@ def test_names_are_escaped(world: Any, page_of: Any) -> None:
     evaluation = evaluation_of(world)
     html = render_report(evaluation, provenance={"root": f"/data/{evil}"})
     assert not any(tag in html for tag in ("<script", "<i>day", "<b>bold"))
-    text = page_of(html).text
+    text = Page(html).text
     assert name in text and f"why {evil}" in text
 
 
-def test_the_steps_of_the_paper_come_first(world: Any, page_of: Any) -> None:
+def test_the_steps_of_the_paper_come_first(world: Any) -> None:
     steps = [
         {"name": "ASLFeat", "on": True, "why": "preset megloc"},
         {"name": "poses refined by ICP", "on": False, "why": "<no> depth"},
     ]
     html = render_report(evaluation_of(world), provenance={"preset": "megloc", "steps": steps})
-    text = page_of(html).text
+    text = Page(html).text
     assert "Stages: 1 of 2 are on" in text
     assert text.index("ASLFeat") < text.index("poses refined by ICP") < text.index("Recall")
     assert "<no> depth" in text and "<no>" not in html
     assert "steps" not in html.partition("<pre>")[2]  # not once more at the end
 
 
-def test_files(world: Any, tmp_path: Path, page_of: Any) -> None:
+def test_files(world: Any, tmp_path: Path) -> None:
     evaluation = evaluation_of(world)
     options = {"map_poses": world.mapped, "provenance": {"preset": "classic"}}
     paths = write_report(tmp_path / "evaluation", evaluation, **options)
 
-    page = page_of(paths["report.html"].read_text())
+    page = Page(paths["report.html"].read_text())
     assert page.references
     with pytest.raises(OutputError, match="recall"):
         write_report(paths["recall.txt"], evaluation)
@@ -93,9 +92,9 @@ def test_files(world: Any, tmp_path: Path, page_of: Any) -> None:
 
 
 @pytest.fixture
-def results(worlds: Callable[..., Any]) -> list[Evaluation]:
+def results() -> list[Evaluation]:
     """Two results on one truth; the second has lost the first eight poses of the day."""
-    world = worlds(num_queries=60)
+    world = make_world(num_queries=60)
     options = {"conditions": world.conditions, "statuses": world.statuses}
     lost = sorted(n for n in world.estimated if world.conditions[n] == "day")[:8]
     fewer = {name: pose for name, pose in world.estimated.items() if name not in lost}
@@ -125,8 +124,8 @@ def test_text(results: list[Evaluation]) -> None:
     assert "/data/runs/al...xxx/localized" in report_text(compare(long))
 
 
-def test_queries_are_shown_the_worst_first(worlds: Callable[..., Any], page_of: Any) -> None:
-    world = worlds(num_queries=40)
+def test_queries_are_shown_the_worst_first() -> None:
+    world = make_world(num_queries=40)
     posed = dict(sorted(world.estimated.items())[:12])
     evaluation = evaluate_poses(posed, world.truth, statuses=world.statuses)
     ranked = shown_queries(evaluation)
@@ -136,13 +135,13 @@ def test_queries_are_shown_the_worst_first(worlds: Callable[..., Any], page_of: 
     # the gallery is not of queries without a pose alone
     chosen = worst_queries(ranked)
     assert chosen == [*ranked[28:33], *ranked[:5]]
-    text = page_of(render_report(evaluation)).text
+    text = Page(render_report(evaluation)).text
     assert all(query.name in text for query in ranked) and "6 inliers, 12 needed" in text
 
 
-def test_refinement_before_and_after(displace: Any) -> None:
+def test_refinement_before_and_after() -> None:
     truth = {name: HERE for name in "abcd"}
-    off = {m: displace(HERE, np.array([m, 0.0, 0.0]), 0.0) for m in (0.4, 0.3, 0.2, 0.1, 0.02)}
+    off = {m: displaced(HERE, np.array([m, 0.0, 0.0]), 0.0) for m in (0.4, 0.3, 0.2, 0.1, 0.02)}
 
     def row(method: str, before: float, reason: str = "", after: float = 0.0) -> PoseRefinement:
         moved_m = before - after if after else 0.0
@@ -207,7 +206,7 @@ def moved(metres: float) -> RigidTransform:
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (metres, 0.0, 0.0))
 
 
-def test_the_whole_table() -> None:
+def test_text_of_a_recall_table() -> None:
     truth = dict.fromkeys(["d1", "d2", "d3", "n1", "n2"], HERE)
     estimated = {"d1": moved(0.001), "d2": moved(0.1), "d3": moved(2.0), "n1": moved(0.4)}
     conditions = {name: {"d": "day", "n": "night"}[name[0]] for name in truth}
@@ -215,7 +214,7 @@ def test_the_whole_table() -> None:
     assert text == TABLE
 
 
-def test_no_pose_at_all_strangers_and_thresholds_without_angles() -> None:
+def test_text_without_poses_and_without_angles() -> None:
     strangers = {f"x{i}.jpg": HERE for i in range(1000)}
     text = report_text(evaluate_poses(strangers, {"a.jpg": HERE}))
     for words in ("0.0 / 0.0 / 0.0 / 0.0", "no query has a pose", "the names may not agree"):

@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 import pytest
 from kapture.io.csv import kapture_from_dir
-from scored import evaluate_poses
+from scored import evaluate_poses, upright_camera, write_kapture
 
 from megloc_kapture.evaluation import view as scenes
 from megloc_kapture.evaluation.report.queries import (
@@ -89,7 +89,7 @@ def check_corners(camera: Camera, pose: RigidTransform, frustum: np.ndarray) -> 
 
 
 @pytest.fixture
-def make_map(tmp_path: Path, upright: Any, kaptures: Any) -> Callable[..., Path]:
+def make_map(tmp_path: Path) -> Callable[..., Path]:
     def make(
         names: Sequence[str] = ("m/0.jpg", "m/1.jpg"),
         camera: Camera = CAMERAS[0],
@@ -97,10 +97,10 @@ def make_map(tmp_path: Path, upright: Any, kaptures: Any) -> Callable[..., Path]
         offset: float = 0.0,
     ) -> Path:
         poses = {
-            name: upright(np.array([offset + 3.0 * k, k * 0.5, 1.6]), 0.3 * k)
+            name: upright_camera(np.array([offset + 3.0 * k, k * 0.5, 1.6]), 0.3 * k)
             for k, name in enumerate(names)
         }
-        root: Path = kaptures(tmp_path / "map", names, poses, camera)
+        root: Path = write_kapture(tmp_path / "map", names, poses, camera)
         write_points3d(root, np.zeros((1, 6)) if points is None else points)
         (root / "reconstruction" / "observations.txt").write_text("# kapture format: 1.1\n")
         return root
@@ -123,9 +123,7 @@ def evaluation_of(world: Any) -> Evaluation:
 @pytest.mark.parametrize(
     ("camera", "offset"), [*((camera, 0.0) for camera in CAMERAS), (CAMERAS[0], 4.2e6)]
 )
-def test_the_page_has_the_data_that_kapture_reads(
-    make_map: Any, camera: Camera, offset: float
-) -> None:
+def test_view_data_equal_kapture(make_map: Any, camera: Camera, offset: float) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack(
         [rng.normal((offset, 0, 0), 5, (500, 3)), rng.integers(0, 256, (500, 3))]
@@ -141,7 +139,7 @@ def test_the_page_has_the_data_that_kapture_reads(
     np.testing.assert_allclose(data["up"], [0, 0, 1], atol=1e-9)
 
 
-def test_many_points_and_cameras_are_drawn_in_part(make_map: Any, monkeypatch: Any) -> None:
+def test_large_scenes_are_subsampled(make_map: Any, monkeypatch: Any) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.normal(0, 5, (900, 3)), rng.integers(0, 256, (900, 3))])
     monkeypatch.setattr(scenes, "MAX_CAMERAS", 10)
@@ -158,10 +156,10 @@ def test_many_points_and_cameras_are_drawn_in_part(make_map: Any, monkeypatch: A
     assert {tuple(row) for row in scene.points.tolist()} <= known
 
 
-def test_names_cannot_leave_the_data(world: Any, make_map: Any, upright: Any) -> None:
+def test_names_are_escaped_in_the_view(world: Any, make_map: Any) -> None:
     root = make_map()
     name = f"query/{EVIL}"
-    world.truth[name] = world.estimated[name] = upright(np.zeros(3), 0.0)
+    world.truth[name] = world.estimated[name] = upright_camera(np.zeros(3), 0.0)
     world.conditions = dict.fromkeys(world.truth, EVIL)
     world.statuses[name] = LocalizationResult(name=name, reason=EVIL)
     evaluation = evaluation_of(world)
@@ -188,18 +186,18 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
     drawings = zip(data["queries"], data["frusta"], data["trueFrusta"], strict=True)
     for query, frustum, true in drawings:
         name = query["name"]
-        one = by_image[name]
+        result = by_image[name]
         np.testing.assert_allclose(data["origin"] + true[0], world.truth[name].center(), atol=1e-5)
-        if one.outcome == "missing":
+        if result.outcome == "missing":
             assert np.isnan(frustum).all() and query["meaning"] == "no pose"
-            assert query["error"] is None and one.reason in query["facts"][0]
+            assert query["error"] is None and result.reason in query["facts"][0]
             continue
         center = world.estimated[name].center()
         np.testing.assert_allclose(data["origin"] + frustum[0], center, atol=1e-5)
-        assert query["error"] == one.position_m
+        assert query["error"] == result.position_m
         within = [
             t for t in evaluation.thresholds
-            if one.position_m <= t.position_m and one.angle_deg <= (t.angle_deg or np.inf)
+            if result.position_m <= t.position_m and result.angle_deg <= (t.angle_deg or np.inf)
         ]  # fmt: skip
         expected = f"within {within[0]}" if within else f"beyond {evaluation.thresholds[-1]}"
         assert query["meaning"] == expected
@@ -209,7 +207,7 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
     assert [m for _, m in used][-1] == "no pose" and len({c for c, _ in used}) == len(used)
 
 
-def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
+def test_coordinate_frames_are_separate(world: Any, make_map: Any) -> None:
     names = [f"m/{k}.jpg" for k in range(4)]
     root = make_map(names, points=np.zeros((3, 6)))
     (root / "reconstruction" / "observations.txt").write_text(
@@ -232,7 +230,7 @@ def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
     assert scene_of("nothing", StoredInliers(ResultContext())) is None
 
 
-def test_points_without_colours_take_them_from_the_images(make_map: Any) -> None:
+def test_points_without_colours_get_image_colours(make_map: Any) -> None:
     names = ["m/0.jpg", "m/1.jpg"]
     root = make_map(names, points=np.zeros((4, 6)))
     (root / "reconstruction" / "observations.txt").write_text(
