@@ -272,7 +272,7 @@ def test_most_of_the_images_decide(wrong: list[bool]) -> None:
 
 def test_few_images_decide_nothing_and_no_more_are_asked_for_than_needed() -> None:
     few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
-    assert "not known" in few.reason and few.images == MIN_TESTED - 1
+    assert "unknown" in few.reason and few.images == MIN_TESTED - 1
     assert judge_consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
     asked = iter([known(1.0)] * 100)
     assert judge_consistency(asked).images == MAX_TESTED

@@ -232,7 +232,7 @@ def test_each_bound_keeps_the_old_pose(case: Case) -> None:
     for options, reason in (
         ({"max_translation_m": 0.05}, "would move"),
         ({"max_rotation_deg": 1.0}, "would turn"),
-        ({"min_correlation": 0.99}, "correlate"),
+        ({"min_correlation": 0.99}, "correlation"),
         ({"min_significance": 20.0}, "cost improves"),
         ({"min_overlap": 1.0}, "cover"),
     ):
