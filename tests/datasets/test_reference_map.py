@@ -1,4 +1,4 @@
-"""A sparse model as a kapture map: read back by kapture itself, and localizable."""
+"""A sparse model as a kapture map, with the features of a COLMAP database or without."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
-# as a model lists them: not sorted, and one image that was not imported
+# unsorted, with an image that is not imported
 NAMES = ("db/b.jpg", "db/a.jpg", "gone/c.jpg", "db/d.jpg")
 # point, image, feature, x, y
 ROWS = [
@@ -59,7 +59,7 @@ def keypoints_by_kapture(folder: Path, image: str) -> Any:
     return kapture.io.features.image_keypoints_from_file(path, np.float32, 2)
 
 
-def test_kapture_reads_the_map(tmp_path: Path) -> None:
+def test_kapture_reads_the_points_and_observations_of_the_model(tmp_path: Path) -> None:
     photographs, output = tmp_path / "images", tmp_path / "reference"
     photographs.mkdir()
     counts = write_reference_map(output, data(), {"": photographs}, NAMES, points())
@@ -73,7 +73,7 @@ def test_kapture_reads_the_map(tmp_path: Path) -> None:
     table = read.points3d.as_array()
     assert np.array_equal(table[:, :3], np.arange(12.0).reshape(4, 3) / 7)
     assert np.array_equal(table[:, 3:], np.arange(12.0).reshape(4, 3))
-    # numbered without gaps, in the order of the model's ids
+    # keypoints are numbered without gaps, in the order of the model's ids
     assert keypoints_by_kapture(output, "db/b.jpg").tolist() == [[5, 6], [1, 2]]
     assert keypoints_by_kapture(output, "db/a.jpg").tolist() == [[7, 8], [3, 4]]
     assert read.keypoints["sift"] == {"db/a.jpg", "db/b.jpg"}
@@ -113,7 +113,7 @@ def write_database(
 FEATURES = {"db/a.png": 10, "db/b.png": 901, "db/d.png": 0, "other.png": 2}
 
 
-def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None:
+def test_all_features_of_a_database_keep_their_numbers(tmp_path: Path) -> None:
     written = write_database(tmp_path / "d.db", FEATURES, shift=0.01)
     output = tmp_path / "map"
     counts = write_reference_map(output, data(), {}, NAMES, points(), database=tmp_path / "d.db")
@@ -122,18 +122,17 @@ def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None
     folder.validate()
     for name in ("a", "b"):
         keypoints, descriptors = written[f"db/{name}.png"]
-        found = folder.keypoints("sift").read(f"db/{name}.jpg")
-        assert np.array_equal(found, keypoints[:, :2])
+        read = folder.keypoints("sift").read(f"db/{name}.jpg")
+        assert np.array_equal(read, keypoints[:, :2])
         assert np.array_equal(folder.descriptors("sift").read(f"db/{name}.jpg"), descriptors)
     config = folder.descriptors("sift").config
     assert (config.keypoints_type, config.metric_type) == ("sift", "L2")
-    # all images have features, if none: so they can be matched
+    # images without keypoints have empty arrays
     assert folder.keypoints("sift").names == ["db/a.jpg", "db/b.jpg", "db/d.jpg"]
     assert folder.keypoints("sift").read("db/d.jpg").shape == (0, 2)
     assert folder.descriptors("sift").read("db/d.jpg").shape == (0, 128)
-    read = kapture.io.csv.kapture_from_dir(str(output))
-    assert read.descriptors["sift"] == {"db/a.jpg", "db/b.jpg", "db/d.jpg"}
-    assert read.observations[0, "sift"] == [("db/b.jpg", 900), ("db/a.jpg", 7), ("db/b.jpg", 4)]
+    theirs = kapture.io.csv.kapture_from_dir(str(output))
+    assert theirs.observations[0, "sift"] == [("db/b.jpg", 900), ("db/a.jpg", 7), ("db/b.jpg", 4)]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +144,7 @@ def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None
         (FEATURES, {"descriptors": 9}, r"descriptors of 'db/a.jpg' have the shape \(9, 128\)"),
     ],
 )
-def test_another_model_s_database_is_refused(
+def test_the_database_of_another_model_is_refused(
     tmp_path: Path, names: dict[str, int], options: dict[str, Any], match: str
 ) -> None:
     path = tmp_path / "d.db"
@@ -155,11 +154,11 @@ def test_another_model_s_database_is_refused(
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_the_exact_name_comes_before_another_suffix(tmp_path: Path) -> None:
+def test_the_exact_name_takes_precedence_over_another_suffix(tmp_path: Path) -> None:
     names = {"db/a.jpg": 10, "db/a.png": 10, "db/b.jpg": 901}
     written = write_database(tmp_path / "d.db", names)
     write_reference_map(tmp_path, data(), {}, NAMES, points(), database=tmp_path / "d.db")
-    # an image that the database does not have
+    # an image that is not in the database
     assert KaptureFolder(tmp_path).descriptors("sift").read("db/d.jpg").shape == (0, 128)
-    found = KaptureFolder(tmp_path).keypoints("sift").read("db/a.jpg")
-    assert np.array_equal(found, written["db/a.jpg"][0][:, :2])
+    read = KaptureFolder(tmp_path).keypoints("sift").read("db/a.jpg")
+    assert np.array_equal(read, written["db/a.jpg"][0][:, :2])

@@ -1,4 +1,4 @@
-"""4Seasons' challenges: pairs, priors and true poses."""
+"""Relocalization challenges of 4Seasons: pairs, priors and true poses."""
 
 from __future__ import annotations
 
@@ -46,11 +46,12 @@ def many_keyframes(root: Path, count: int) -> list[int]:
     [
         (DAY, SNOW, f"relocalizationFile_{DAY}_to_{SNOW}.txt"),
         ("loop_2_train", "loop_2_test", "reloc_loop_2_train_to_loop_2_test.txt"),
-        (DAY, SNOW, f"{DAY}/RelocalizationFilesTest/relocalizationFile_{SNOW}_hard.txt"),
         (DAY, SNOW, f"{DAY}/relocalizationFile_{SNOW}.txt"),
     ],
 )
-def test_relocalization_files(root: Path, tmp_path: Path, day: str, snow: str, name: str) -> None:
+def test_relocalization_files_select_images_and_priors(
+    root: Path, tmp_path: Path, day: str, snow: str, name: str
+) -> None:
     times = many_keyframes(root, 50)
     if day != DAY:
         (root / DAY).rename(root / day)
@@ -65,7 +66,7 @@ def test_relocalization_files(root: Path, tmp_path: Path, day: str, snow: str, n
         tables.RelocalizationPair(pose_file, image(day, times[25]), image(snow, B + 5)),
         tables.RelocalizationPair(pose_file, image(day, times[3]), image(snow, B + 5)),
     ]
-    # the images that are asked for, in the recordings that are meant
+    # only images of the pairs, in the recordings of the file's name
     assert times_of(dataset.query) == {B + 5}
     assert {n.split("/")[0] for n in dataset.mapping.image_names()} == {day}
     # 20 keyframes around each reference: 5 to 45, and 0 to 23
@@ -84,8 +85,7 @@ def test_relocalization_files(root: Path, tmp_path: Path, day: str, snow: str, n
     assert not dataset.remarks
 
 
-def test_more_than_is_asked_for(root: Path) -> None:
-    """All frames of a recording are queries if one wants them; scored are those asked for."""
+def test_with_all_frames_only_those_of_the_pairs_are_scored(root: Path) -> None:
     write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
     dataset = read(root, frames="all")
     assert times_of(dataset.query) == {A + 5, B + 5}
@@ -93,8 +93,7 @@ def test_more_than_is_asked_for(root: Path) -> None:
     assert scored == [image(SNOW, B + 5)]
 
 
-def test_pairs_with_poses_in_the_frame_of_poses_txt(root: Path) -> None:
-    """As in 2020: the map's poses are already in one frame, queries are known relative to it."""
+def test_pairs_of_2020_have_poses_relative_to_poses_txt(root: Path) -> None:
     (root / DAY / "GNSSPoses.txt").unlink()
     (root / DAY / "Transformations.txt").unlink()
     write(root / DAY / "poses.txt", f"# ts t q\n{A} 100.5 7 3 0 0 0 1\n{B} 101.5 7 3 0 0 0.6 0.8\n")
@@ -112,14 +111,14 @@ def test_pairs_with_poses_in_the_frame_of_poses_txt(root: Path) -> None:
     assert "poses.txt, in a separate frame" in dataset.remarks[0]
 
 
-def test_truth_of_a_pair_counts_before_the_recordings_own(root: Path) -> None:
+def test_the_pose_of_a_pair_takes_precedence_over_that_of_the_recording(root: Path) -> None:
     write_recording(root, RAIN, (A + 9,), (f"{A + 9},0,0,0,0,0,0,1,1,2",))
     write(root / f"reloc_{DAY}_to_{RAIN}.txt", f"{A} {A + 9} 0 0 0 0 0 0 1\n")
     dataset = read(root)
     assert pose_of(dataset, image(RAIN, A + 9)) == pose_of(dataset, image(DAY, A))
 
 
-def test_pairs_that_cannot_be(root: Path) -> None:
+def test_pairs_of_unknown_images_are_skipped(root: Path) -> None:
     write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n77 {B + 5}\n{A} 78\n")
     dataset = read(root)
     assert [pair.query for pair in dataset.relocalization] == [image(SNOW, A + 5)]
@@ -127,7 +126,7 @@ def test_pairs_that_cannot_be(root: Path) -> None:
     assert missing_of(dataset) == [root / image(SNOW, 78, c) for c in ("cam0", "cam1")]
 
 
-def test_recordings_that_files_mean_and_are_not_there(root: Path) -> None:
+def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
     write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n")
     write(root / f"reloc_{DAY}_to_garage.txt", f"{A} 1\n")
     assert missing_of(read(root)) == [root / "garage"]
