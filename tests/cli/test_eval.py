@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from aachen_files import write_v1_0
 
-from megloc_kapture.io.images import write_depth_map, write_image
-from megloc_kapture.io.kapture import KaptureFolder, Sensor, read_pairs, write_sensors
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs, write_sensors
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.values import RigidTransform
 
 STAGES = (
     *("import", "local_features", "global_features", "mapping_pairs", "mapping_matches", "map"),
@@ -93,16 +92,6 @@ def test_all_queries_of_the_small_scene_are_localized(finished: Path) -> None:
     assert all(s.status == "localized" and s.fallback == "none" for s in statuses.values())
 
 
-def test_a_manifest_has_the_options_and_inputs_of_its_stage(finished: Path) -> None:
-    manifest = json.loads((finished / "stages" / "local_features.json").read_text())
-    choice = {"name": "rootsift", "options": {"max_keypoints": 800}}
-    assert manifest["options"]["local_features"] == [choice]
-    assert manifest["counts"]["images"] == 11
-    code = "code of megloc_kapture.features.rootsift.RootSift"
-    assert set(manifest["inputs"]) == {"import", code}
-    assert manifest["seconds"] > 0 and manifest["versions"]["pycolmap"]
-
-
 def test_the_pose_file_is_copied_to_the_folder_of_submissions(
     evaluate: Any, scene: Path, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,30 +165,6 @@ def test_import_options_reach_the_dataset(megloc: Any, tmp_path: Path) -> None:
     assert done.status == 2 and "the model of Aachen Day-Night v1.1 is missing" in done.err
     done = megloc(*command, "--import-option", "version")
     assert done.status == 2 and "--import-option takes key=value" in done.err
-
-
-def test_the_dry_run_lists_refinement_only_for_queries_with_depth(
-    evaluate: Any, dataset: Path, tmp_path: Path
-) -> None:
-    assert "refine_poses" not in evaluate(dataset, tmp_path / "run", "--dry-run").err
-    folder = KaptureFolder(dataset / "query")
-    data = folder.read()
-    (timestamp, camera), *_ = data.records_camera
-    depth = Sensor.from_camera(data.sensors[camera].camera(), name="tof", sensor_type="depth")
-    rig = {sensor: RigidTransform.identity() for sensor in (camera, "tof")}
-    with_depth = replace(
-        data,
-        sensors={**data.sensors, "tof": depth},
-        rigs={"rig": rig},
-        records_depth={(timestamp, "tof"): "a.depth"},
-    )
-    write_sensors(dataset / "query", with_depth)
-    size = depth.camera()
-    write_depth_map(folder.depth_path("a.depth"), np.ones((size.height, size.width)))
-    lines = evaluate(dataset, tmp_path / "run", "--dry-run").err.splitlines()
-    assert "refine_poses: would run (not done yet)" in lines
-    off = evaluate(dataset, tmp_path / "run", "--dry-run", "--set", "pose_refinement.by=[]")
-    assert "refine_poses" not in off.err
 
 
 def test_from_uses_files_of_another_tool_as_they_are(

@@ -198,26 +198,18 @@ def test_a_correct_pose_file_has_no_problem(megloc: Any, aachen: Path, place: Pa
     done = megloc("check", "aachen", place)
     assert (done.status, done.out) == (0, "4 poses of 4 queries: no problem found\n")
     assert done.err == "compared with runs/aachen-classic\n"
-    assert megloc("check", "aachen", place, "-q").err == ""
-    assert megloc("check", "synthetic-aachen", place, "--data", aachen).status == 0
+    assert megloc("check", "synthetic-aachen", place, "--data", aachen, "-q").err == ""
 
 
-def test_problems_of_a_pose_file_are_listed(
-    megloc: Any, aachen: Path, poses: Poses, place: Path
-) -> None:
+@pytest.mark.usefixtures("aachen")
+def test_problems_of_a_pose_file_are_listed(megloc: Any, poses: Poses, place: Path) -> None:
     write_pose_file(place, {name: pose.inverse() for name, pose in poses.items()})
     with place.open("a") as file:
-        file.write("stranger.jpg 1 0 0\n0001.png 1 1 0 0 0 0 0\n")
+        file.write("stranger.jpg 1 0 0\n")
     done = megloc("check", "aachen", place)
-    assert (done.status, "compared" in done.err) == (2, True)
-    first, *others, outcome = done.out.splitlines()
-    assert "0001.png should be 0001.jpg" in others[0]
-    assert first.startswith("error: poses.txt: poses inverted (camera-to-world, world_from_cam)")
-    assert any("poses.txt:5: 4 columns instead of 8" in line for line in others)
-    assert any("stranger.jpg is no name of the list" in line for line in others)
-    assert "quaternion of length 1.41421, not 1" in done.out
-    assert outcome.startswith("4 poses of 4 queries: ") and "problems found" in outcome
-    done = megloc("check", "aachen", place, "--json")
-    content = json.loads(done.out)
-    assert done.status == 2 and content["ok"] is False
-    assert content["findings"][0]["kind"] == "convention"
+    assert done.status == 2
+    assert done.out.startswith("error: poses.txt: poses inverted (camera-to-world")
+    assert "poses.txt:5: 4 columns instead of 8" in done.out
+    assert done.out.splitlines()[-1].startswith("4 poses of 4 queries: ")
+    content = json.loads(megloc("check", "aachen", place, "--json").out)
+    assert content["ok"] is False and content["findings"][0]["kind"] == "convention"

@@ -107,17 +107,6 @@ def test_the_result_has_upright_images_with_their_estimated_cameras(
         assert out.image_path(name).is_symlink() == (orientation == 1)
 
 
-def test_a_result_can_be_localized_again_with_its_cameras(
-    megloc: Any, finished: Path, localized: tuple[Path, str], tmp_path: Path
-) -> None:
-    again = tmp_path / "again"
-    command = ("localize", "-i", finished / "map", "--query", localized[0], "-o", again)
-    assert megloc(*command).status == 0
-    before, after = (KaptureFolder(root).read().poses() for root in (localized[0], again))
-    for name, pose in before.items():
-        assert np.linalg.norm(after[name].center() - pose.center()) < 0.03
-
-
 def test_a_given_camera_is_used_as_in_a_kapture_folder(
     megloc: Any, finished: Path, scene: Path, tmp_path: Path
 ) -> None:

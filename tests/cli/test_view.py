@@ -13,7 +13,6 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 from PIL import Image
 
-import megloc_kapture as megloc_package
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.tables import read_status
 
@@ -46,23 +45,6 @@ def test_a_view_shows_a_map_a_result_and_its_errors(
     expected = evaluate(finished / "localized", finished / "query_gt")
     errors = {query.image: query.position_m for query in expected.queries}
     assert {query["name"]: query["error"] for query in data_of(out)["queries"]} == errors
-
-
-def test_the_view_from_python_shows_live_and_saved_results_alike(
-    finished: Path, tmp_path: Path, data_of: Any
-) -> None:
-    opened = megloc_package.open_map(finished / "map", features_dirs=[finished])
-    results = opened.localize(finished / "query")
-    results.view(tmp_path / "live.html", finished / "query_gt")
-    live = data_of(tmp_path / "live.html")
-    assert len(live["queries"]) == len(results)
-    for query in live["queries"]:
-        assert query["error"] is not None
-        assert query["drawn"] == min(results[query["name"]].num_inliers, 300)
-    results.save(tmp_path / "localized")
-    opened.view(tmp_path / "saved.html", tmp_path / "localized", finished / "query_gt")
-    saved = data_of(tmp_path / "saved.html")
-    assert saved["frusta"] == live["frusta"] and saved["trueFrusta"] == live["trueFrusta"]
 
 
 def browse(page: Path, width: int, height: int, tmp_path: Path, *, script: str = "") -> Image.Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,9 @@ from megloc_kapture.io.kapture.features import (
     FeatureConfig,
     FeatureReader,
     FeatureWriter,
+    TarBlobs,
     feature_folder,
     list_types,
-    read_config,
 )
 from megloc_kapture.io.kapture.matches import (
     ImagePair,
@@ -86,10 +87,6 @@ def test_features_outside_a_kapture_have_the_layout_of_kapture_localization(tmp_
     ]
 
 
-def config_file(folder: Path, row: str) -> None:
-    (folder / "keypoints.txt").write_text(f"# kapture format: 1.1\n# header\n{row}\n")
-
-
 def test_the_first_of_several_folders_is_used_and_their_configurations_must_agree(
     tmp_path: Path,
 ) -> None:
@@ -102,15 +99,9 @@ def test_the_first_of_several_folders_is_used_and_their_configurations_must_agre
     features = FeatureReader("keypoints", "T", folders)
     assert features.names == ["a", "b", "both"]
     assert [features.read(i)[0, 0] for i in features.names] == [1, 2, 1]
-    config_file(folders[1], "n, float32, 2")
+    (folders[1] / "keypoints.txt").write_text("# kapture format: 1.1\nn, float32, 2\n")
     with pytest.raises(DataError, match=r"query/.*keypoints\.txt: 2 x float32, but .*3 x float32"):
         FeatureReader("keypoints", "T", folders)
-
-
-def test_a_configuration_without_a_row_is_refused(tmp_path: Path) -> None:
-    config_file(tmp_path, "")
-    with pytest.raises(DataError, match="no row"):
-        read_config(tmp_path / "keypoints.txt", "keypoints")
 
 
 def test_a_writer_continues_a_folder_of_the_same_configuration_only(tmp_path: Path) -> None:
@@ -121,6 +112,20 @@ def test_a_writer_continues_a_folder_of_the_same_configuration_only(tmp_path: Pa
         assert "b" not in writer
     with pytest.raises(OutputError, match="another configuration"):
         FeatureWriter(tmp_path, "keypoints", "T", FeatureConfig("n", np.dtype("float32"), 2))
+
+
+def test_members_of_a_tar_of_the_current_folder_are_read_by_name(tmp_path: Path) -> None:
+    contents = {"a.kpt": b"x" * 1000, "deep/er/b.kpt": b"", "é ü.kpt": b"y" * 512}
+    for name, content in contents.items():
+        (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "in" / name).write_bytes(content)
+    with tarfile.open(tmp_path / "x.tar", "w") as file:
+        file.add(tmp_path / "in", ".")
+    blobs = pickle.loads(pickle.dumps(TarBlobs(tmp_path / "x.tar", ".kpt")))
+    assert blobs.names() == sorted(contents)
+    assert {name: blobs.read(name) for name in contents} == contents
+    assert blobs.size("a.kpt") == 1000 and "a" not in blobs
+    assert TarBlobs(tmp_path / "x.tar", ".desc").names() == []
 
 
 # -------------------------------------------------------------------------------------- matches
@@ -166,18 +171,7 @@ def test_files_named_in_the_other_order_are_read(tmp_path: Path) -> None:
     assert np.array_equal(matches.read("a", "b")[0], INDICES[:, ::-1])
 
 
-HEAD = "# kapture format: 1.1\n# query_image, map_image, score\n"
-
-
-def test_pairs_read_back_in_their_order(tmp_path: Path) -> None:
-    rows = [("q 2", "m/1", 1 / 3), ("q1", "m2", -1.0), ("q1", "m1", 2.0)]
-    pairs = [ImagePair(*row) for row in rows]
-    write_pairs(tmp_path / "pairs" / "query.txt", pairs)
-    assert read_pairs(tmp_path / "pairs" / "query.txt") == pairs
-    text = (tmp_path / "pairs" / "query.txt").read_text()
-    assert text == HEAD + "q 2, m/1, 0.3333333333333333\nq1, m2, -1.0\nq1, m1, 2.0\n"
-
-
-def test_a_repeated_pair_counts_once(tmp_path: Path) -> None:
-    (tmp_path / "p.txt").write_text("a, b, 1\nb, a, 1\na, b, 2\n")
-    assert read_pairs(tmp_path / "p.txt") == [ImagePair("a", "b", 1.0), ImagePair("b", "a", 1.0)]
+def test_pairs_read_back_in_their_order_without_repetitions(tmp_path: Path) -> None:
+    pairs = [ImagePair("q 2", "m/1", 1 / 3), ImagePair("q1", "m2", -1.0), ImagePair("m2", "q1", 2)]
+    write_pairs(tmp_path / "pairs.txt", [*pairs, ImagePair("q1", "m2", 5.0)])
+    assert read_pairs(tmp_path / "pairs.txt") == pairs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -174,3 +175,18 @@ def test_observations_of_removed_images_are_ignored(root: Path) -> None:
     for path in (root / "reconstruction").rglob("c.jpg.*"):
         path.unlink()
     KaptureFolder(root).validate()
+
+
+def test_features_shared_by_two_images_of_one_name_are_refused(root: Path, tmp_path: Path) -> None:
+    features = root / "reconstruction"
+    for name in ("keypoints", "descriptors"):
+        shutil.copytree(features / name / "T", tmp_path / "shared/local_features/T" / name)
+    query = tmp_path / "query"
+    shutil.copytree(root / "sensors", query / "sensors")
+    shared = [KaptureFolder(place, features_dirs=[tmp_path / "shared"]) for place in (root, query)]
+    shared[0].check_features_apart(shared[1])
+    write_image(query / "sensors/records_data/a.jpg", np.full((6, 8, 3), 50, np.uint8))
+    with pytest.raises(
+        DataError, match=r"a\.jpg\.kpt: a\.jpg is another image in .*--features-dir"
+    ):
+        shared[0].check_features_apart(shared[1])

@@ -238,28 +238,3 @@ def test_kapture_and_we_read_the_same_pairs(tmp_path: Path) -> None:
         rows = [[p.query, p.map, p.score] for p in pairs]
         kapture.io.csv.table_to_file(file, rows, header="# query_image, map_image, score")
     assert read_pairs(tmp_path / "theirs.txt") == pairs
-
-
-@pytest.mark.slow
-def test_kapture_and_we_read_the_same_foreign_map(shared_data: Path) -> None:
-    root = shared_data / "foreign_maps/virtual_gallery/map"
-    theirs = kapture.io.csv.kapture_from_dir(str(root))
-    folder = KaptureFolder(root)
-    folder.validate(deep=True)
-    assert np.array_equal(folder.points3d(), theirs.points3d.as_array())
-    ours = folder.observations()["r2d2_500"]
-    rows = [
-        (point, image, keypoint)
-        for point, kind in sorted(theirs.observations.key_pairs())
-        for image, keypoint in theirs.observations[point, kind]
-    ]
-    names = np.array(ours.image_names)[ours.image_ids].tolist()
-    found = zip(ours.point_ids.tolist(), names, ours.keypoint_ids.tolist(), strict=True)
-    assert rows == list(found) and len(rows) == 3766
-    for key, pose in folder.read().trajectories.items():
-        assert np.allclose(theirs.trajectories[key].r_raw, pose.quat_wxyz, atol=1e-12)
-        assert tuple(theirs.trajectories[key].t_raw) == pose.translation
-    keypoints, descriptors = folder.keypoints("r2d2_500"), folder.descriptors("r2d2_500")
-    assert set(keypoints.names) == theirs.keypoints["r2d2_500"]
-    assert (keypoints.config.name, descriptors.config.keypoints_type) == ("r2d2", "r2d2_500")
-    assert folder.global_features("AP-GeM-LM18").read(ours.image_names[0]).shape == (2048,)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ FOLDER = Path("reconstruction/global_features/G")
 NAMES = [f"{k % 3}/{k:03d}.jpg" for k in range(40)]
 
 
-def write(root: Path, rows: NDArray[Any]) -> FeatureReader:
+def write(root: Path, rows: NDArray[np.floating]) -> FeatureReader:
     config = FeatureConfig("g", rows.dtype, rows.shape[1], None, "L2")
     with FeatureWriter(root, "global_features", "G", config) as writer:
         for name, row in zip(NAMES, rows, strict=False):
@@ -36,12 +35,6 @@ def test_blocks_hold_unit_rows_in_the_order_of_the_images(tmp_path: Path) -> Non
     out = np.empty((9, 5), dtype=np.float32)
     assert blocks.read(3, 12, out=out) is out
     np.testing.assert_allclose(out, unit[3:12], atol=1e-6)
-
-
-def test_integer_vectors_are_normalised_too(tmp_path: Path) -> None:
-    features = write(tmp_path, np.array([[3, 4], [0, 2]], np.uint8))
-    read = KaptureVectors(features, NAMES[:2]).read(0, 2)
-    np.testing.assert_allclose(read, [[0.6, 0.8], [0, 1]], atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e37])

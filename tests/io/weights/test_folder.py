@@ -20,10 +20,13 @@ from megloc_kapture.io.weights import (
     SOURCE_KEY,
     MissingWeightsError,
     add_weights,
+    by_file_name,
+    by_sha256,
     convert_weights,
     describe,
     fetch,
     find_weights,
+    lookup,
     read_weights,
     registry,
     sha256_of,
@@ -179,13 +182,6 @@ def test_added_files_are_recognised_by_sha256(
     assert [path.name for path in folder.iterdir()] == ["aliked-t16.pth"]
 
 
-def test_added_files_are_recognised_by_their_name(folder: Path, tmp_path: Path) -> None:
-    source = write(tmp_path / "best_deeplabv3plus_resnet101_cityscapes_os16.pth.tar")
-    added = add_weights(source)
-    assert added.path == folder / "best_deeplabv3plus_resnet101_cityscapes_os16.pth"
-    assert find_weights("deeplabv3plus-resnet101") == added and source.is_file()
-
-
 def test_unknown_files_are_added_under_a_given_name(folder: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "model_best.pth")
     with pytest.raises(OptionError, match=r"neither its sha256 nor its name is in the reg"):
@@ -278,3 +274,50 @@ def test_a_checkpoint_may_hold_a_score_of_numpy(tmp_path: Path) -> None:
     for score in (np.float64(0.7), np.float32(0.7)):
         torch.save({"model_state": {"a": torch.ones(1)}, "best_score": score}, tmp_path / "x.pth")
         assert read_weights(find_weights(str(tmp_path / "x.pth"))).keys() == {"a"}
+
+
+# ------------------------------------------------------------------ the registry
+
+
+def test_no_file_is_listed_twice() -> None:
+    names = [n for w in registry().values() for file in w.files for n in file.names]
+    names += [weights.converted for weights in registry().values()]
+    assert len(names) == len(set(names))
+    sums = [file.sha256 for w in registry().values() for file in w.files if file.sha256]
+    assert len(sums) == len(set(sums)) > 20
+    assert all(name == weights.name for name, weights in registry().items())
+
+
+def test_addresses_licences_and_hashes_fit_the_files() -> None:
+    checked = 0
+    for weights in registry().values():
+        assert weights.page.startswith("https://")
+        forbids = re.search(r"noncommercial|research|-NC-|unconfirmed", weights.licence)
+        assert weights.commercial == (forbids is None), weights.name
+        for file in weights.files:
+            # torch.hub calls a file by the first eight digits of its sha256
+            if prefix := re.search(r"-([0-9a-f]{8})\.pth$", file.name):
+                assert file.sha256 is not None and file.sha256.startswith(prefix[1])
+                checked += 1
+            if file.url is not None:
+                assert file.url.startswith("https://")
+                # the address has the folders of the name, perhaps with others between
+                place = iter(file.url.partition("?")[0].split("/"))
+                assert all(part in place for part in file.name.split("/")), file.url
+                assert next(place, None) is None
+    assert checked == 3
+
+
+def test_lookup_suggests_a_similar_name() -> None:
+    assert lookup("xfeat").files[0].name == "xfeat.pt"
+    message = "no weights 'xfeet' in .*; did you mean 'xfeat'\\? there are"
+    with pytest.raises(OptionError, match=message):
+        lookup("xfeet")
+
+
+def test_files_are_recognised_by_name_and_sha256() -> None:
+    weights, _ = by_file_name("superpoint_lightglue_v0-1_arxiv.pth") or (None, None)
+    assert weights is not None and weights.name == "superpoint_lightglue"
+    _, file = by_file_name("alex.pth") or (None, None)
+    assert file is not None and file.name == "v0.1/alex.pth"
+    assert by_file_name("nothing.pth") is None and by_sha256(64 * "0") is None
