@@ -18,9 +18,10 @@ from megloc_kapture.io.dataset_tables import (
     write_protocol,
     write_relocalization,
 )
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import write_status
-from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
+from megloc_kapture.values import LocalizationResult, RigidTransform
+from tests.worlds import one_camera
 
 IMAGES = [f"query/{'night' if i % 4 == 0 else 'day'}/{i:03d}.jpg" for i in range(40)]
 MAPPED = {
@@ -28,12 +29,8 @@ MAPPED = {
 }
 
 
-def write_kapture(root: Path, images: list[str], poses: dict[str, RigidTransform]) -> Path:
-    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
-    records = {(number, "cam"): image for number, image in enumerate(images)}
-    posed = {key: poses[image] for key, image in records.items() if image in poses}
-    write_sensors(root, KaptureData({"cam": camera}, {}, posed, records))
-    return root
+def write_kapture(root: Path, images: list[str], poses: dict[str, RigidTransform]) -> None:
+    write_sensors(root, one_camera(images, poses))
 
 
 def write_candidates(result: Path) -> None:

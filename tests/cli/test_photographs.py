@@ -107,20 +107,6 @@ def test_the_result_has_upright_images_with_their_estimated_cameras(
         assert out.image_path(name).is_symlink() == (orientation == 1)
 
 
-def test_a_given_camera_is_used_as_in_a_kapture_folder(
-    megloc: Any, finished: Path, scene: Path, tmp_path: Path
-) -> None:
-    images, out, known = scene / "query/sensors/records_data", tmp_path / "out", tmp_path / "known"
-    command = ("localize", "-i", finished / "map", "-o")
-    camera = "PINHOLE,400,300,300,302,200,150"
-    assert megloc(*command, out, "--images", images, "--camera", camera).status == 0
-    assert len(KaptureFolder(out).read().sensors) == 1
-    megloc(*command, known, "--query", scene / "query")
-    for name in ("status.csv", "clusters.csv"):
-        assert (out / name).read_bytes() == (known / name).read_bytes()
-    assert KaptureFolder(out).read().poses() == KaptureFolder(known).read().poses()
-
-
 # ------------------------------------------------------------------ real photographs
 
 

@@ -16,24 +16,18 @@ from megloc_kapture.datasets.kapture_folders import (
 from megloc_kapture.errors import DataError
 from megloc_kapture.io import dataset_tables as tables
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.values import Camera, RigidTransform
-
-CAMERA = Camera("SIMPLE_PINHOLE", 8, 6, (10.0, 4.0, 3.0))
+from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
+from megloc_kapture.values import RigidTransform
+from tests.worlds import SMALL_CAMERA, one_camera
 
 
 def write_part(
     root: Path, part: str, names: Sequence[str], *, poses: bool, images: bool = True
 ) -> None:
-    data = KaptureData(sensors={"cam": Sensor.from_camera(CAMERA)})
-    for timestamp, name in enumerate(names):
-        data.records_camera[timestamp, "cam"] = name
-        if poses:
-            data.trajectories[timestamp, "cam"] = RigidTransform.identity()
-        if images:
-            path = root / part / "sensors" / "records_data" / name
-            write_image(path, np.full((6, 8, 3), 99, np.uint8))
-    write_sensors(root / part, data)
+    write_sensors(root / part, one_camera(names, RigidTransform.identity() if poses else None))
+    for name in names if images else ():
+        path = root / part / "sensors" / "records_data" / name
+        write_image(path, np.full((6, 8, 3), 99, np.uint8))
 
 
 @pytest.fixture
@@ -79,7 +73,7 @@ def test_truth_is_optional_and_may_have_other_images(
 @pytest.mark.parametrize("prefix", ["", "q"])
 def test_queries_keep_their_depth_and_masks(root: Path, tmp_path: Path, prefix: str) -> None:
     data = KaptureFolder(root / "query").read()
-    data.sensors["depth"] = Sensor.from_camera(CAMERA, sensor_type="depth")
+    data.sensors["depth"] = Sensor.from_camera(SMALL_CAMERA, sensor_type="depth")
     data.rigs["rig"] = {name: RigidTransform.identity() for name in ("cam", "depth")}
     data.records_depth[0, "depth"] = "b/q.depth"
     write_sensors(root / "query", data)

@@ -10,7 +10,6 @@ import pytest
 from megloc_twins.model_files import write_colmap_binary, write_colmap_text
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.io.colmap_model import (
     ColmapImage,
     ColmapModel,
@@ -140,35 +139,19 @@ def test_rigs_have_the_cameras_whose_pose_is_known(tmp_path: Path) -> None:
     assert len(colmap_model_files(tmp_path)) == 5
 
 
-@pytest.mark.parametrize("form", ["text", "binary"])
-def test_camera_models_of_later_versions(tmp_path: Path, form: str) -> None:
-    """Fisheye models without distortion are converted; others are refused by name."""
-    rays = np.random.default_rng(0).uniform((-2, -2, 0.1), (2, 2, 1), (100, 3))
-    for model, params in {
-        "SIMPLE_FISHEYE": (500.0, 320.0, 240.0),
-        "FISHEYE": (500.0, 510.0, 320.0, 240.0),
-        "DIVISION": (500.0, 510.0, 320.0, 240.0, 0.01),
-        "SIMPLE_DIVISION": (500.0, 320.0, 240.0, 0.01),
-        "RAD_TAN_THIN_PRISM_FISHEYE": (500.0, 500.0, 320.0, 240.0, *[0.001] * 12),
-    }.items():
-        theirs = pycolmap.Camera(camera_id=1, model=model, width=640, height=480, params=params)
-        written = pycolmap.Reconstruction()
-        written.add_camera_with_trivial_rig(theirs)
-        getattr(written, f"write_{form}")(tmp_path)
-        if model in ("SIMPLE_FISHEYE", "FISHEYE"):
-            ours = read_colmap_model(tmp_path).cameras[1]
-            np.testing.assert_allclose(
-                px_from_cam(ours, rays), theirs.img_from_cam(rays), rtol=0, atol=1e-9
-            )
-        else:
-            with pytest.raises(DataError, match=f"cameras.*camera model {model}; .*undistorter"):
-                read_colmap_model(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_truncated_binary_files_are_named(tmp_path: Path, name: str) -> None:
-    write_colmap_binary(tmp_path, small_model())
-    content = (tmp_path / name).read_bytes()
-    (tmp_path / name).write_bytes(content[: len(content) // 2])
-    with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP can read"):
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_DIVISION", (500.0, 320.0, 240.0, 0.01)),
+        ("RAD_TAN_THIN_PRISM_FISHEYE", (500.0, 500.0, 320.0, 240.0, *[0.001] * 12)),
+    ],
+)
+def test_camera_models_that_kapture_lacks_are_refused_by_name(
+    tmp_path: Path, model: str, params: tuple[float, ...]
+) -> None:
+    camera = pycolmap.Camera(camera_id=1, model=model, width=640, height=480, params=params)
+    written = pycolmap.Reconstruction()
+    written.add_camera_with_trivial_rig(camera)
+    written.write_binary(tmp_path)
+    with pytest.raises(DataError, match=f"cameras.*camera model {model}; .*undistorter"):
         read_colmap_model(tmp_path)

@@ -92,34 +92,29 @@ def test_other_recordings_have_other_transformations(root: Path) -> None:
     np.testing.assert_allclose((right @ pose.inverse()).translation, (-0.3, 0, 0), atol=1e-12)
 
 
-def test_kapture_reads_the_written_folders(root: Path, tmp_path: Path) -> None:
-    before = sorted(root.rglob("*"))
+def test_kapture_reads_the_written_rig_and_integer_times(root: Path, tmp_path: Path) -> None:
     write_official(read(root), tmp_path / "out")
     theirs = kapture_from_dir(str(tmp_path / "out/mapping"))
     assert set(theirs.sensors) == set(theirs.rigs["car"]) == {"cam0", "cam1"}
     assert theirs.sensors["cam1"].sensor_params == ["PINHOLE", "8", "4", "5", "5", "4.25", "1.75"]
     np.testing.assert_allclose(theirs.rigs["car", "cam1"].t_raw, [-0.3, 0, 0])
-    assert set(theirs.trajectories) == {A, B}
-    assert set(theirs.trajectories[A]) == {"car"}
+    assert set(theirs.trajectories) == {A, B} and set(theirs.trajectories[A]) == {"car"}
     assert theirs.records_camera[A, "cam1"] == image(DAY, A, "cam1")
     queries = kapture_from_dir(str(tmp_path / "out/query"))
-    assert queries.trajectories is None
-    assert set(queries.records_camera) == {A + 5, B + 5}
-    for part in ("mapping", "query"):
-        folder = KaptureFolder(tmp_path / "out" / part)
-        assert all(folder.image_path(name).is_file() for name in folder.read().image_names())
-    assert sorted(root.rglob("*")) == before
-    # the poses of the queries are unknown
-    assert not (tmp_path / "out/query_gt").exists()
-    groups = tables.read_groups(tmp_path / "out/megloc")
-    assert groups[image(SNOW, A + 5)] == tables.ImageGroup(condition=SNOW)
-    assert not groups[image(SNOW, A + 5, "cam1")].scored
-    assert groups[image(DAY, A)].location == DAY
-    protocol = tables.read_protocol(tmp_path / "out/megloc")
+    assert queries.trajectories is None and set(queries.records_camera) == {A + 5, B + 5}
+
+
+def test_tables_have_the_groups_protocol_and_world_of_the_challenge(root: Path) -> None:
+    dataset = read(root)
+    assert dataset.query_gt is None  # the poses of the queries are unknown
+    assert dataset.groups[image(SNOW, A + 5)] == tables.ImageGroup(condition=SNOW)
+    assert not dataset.groups[image(SNOW, A + 5, "cam1")].scored
+    assert dataset.groups[image(DAY, A)].location == DAY
+    protocol = dataset.protocol
     assert (protocol.dataset, protocol.conditions) == ("4seasons", (SNOW,))
     assert protocol.thresholds == ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
     assert protocol.pose_file == "ltvl"
-    quaternion = tables.read_world(tmp_path / "out/megloc").official_from_local.quat_wxyz
+    quaternion = dataset.world.official_from_local.quat_wxyz
     np.testing.assert_allclose(quaternion, [np.sqrt(0.5), np.sqrt(0.5), 0, 0])
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.kapture.features import (
+    SUFFIX,
     ArrayKind,
     FeatureConfig,
     FeatureReader,
@@ -28,63 +29,39 @@ from megloc_kapture.io.kapture.matches import (
 )
 
 KEYPOINTS = FeatureConfig("name inside", np.dtype("float32"), 3)
+DESCRIPTORS = FeatureConfig("d", np.dtype("uint8"), 4, "k", "L2")
 GLOBAL = FeatureConfig("g", np.dtype("float32"), 16, None, "L2")
 
 
-def reader(root: Path, kind: ArrayKind, type_name: str, *, orphan: bool = False) -> FeatureReader:
-    folder = feature_folder(root, kind, type_name, orphan=orphan)
-    return FeatureReader(kind, type_name, [folder])
-
-
 @pytest.mark.parametrize(
-    ("kind", "dtype", "orphan"),
+    ("kind", "config", "place"),
     [
-        ("keypoints", "float32", False),
-        ("descriptors", "uint8", True),
-        ("global_features", "float64", True),
+        ("keypoints", KEYPOINTS, "local_features/T 1/keypoints"),
+        ("descriptors", DESCRIPTORS, "local_features/T 1/descriptors"),
+        ("global_features", GLOBAL, "global_features/T 1/global_features"),
     ],
 )
-def test_arrays_read_back_equal(tmp_path: Path, kind: ArrayKind, dtype: str, orphan: bool) -> None:
-    rng = np.random.default_rng(0)
-    config = FeatureConfig("f", np.dtype(dtype), 4, "k" if kind == "descriptors" else None, "L2")
-    if kind == "keypoints":
-        config = FeatureConfig("f", np.dtype(dtype), 4)
-    shapes = [(4,), (4,)] if kind == "global_features" else [(5, 4), (0, 4)]
-    arrays = {
-        name: (rng.normal(0, 50, shape) + 100).astype(dtype)
-        for name, shape in zip(["b/x 1.jpg", "a.jpg"], shapes, strict=True)
-    }
-    with FeatureWriter(tmp_path, kind, "T", config, orphan=orphan) as writer:
-        for image, array in arrays.items():
-            assert image not in writer
-            writer.write(image, array)
-            assert image in writer
-    features = pickle.loads(pickle.dumps(reader(tmp_path, kind, "T", orphan=orphan)))
-    assert features.config == config
-    assert features.names == ["a.jpg", "b/x 1.jpg"]
-    assert list_types(tmp_path, kind, orphan=orphan) == ["T"]
-    assert list_types(tmp_path, kind, orphan=not orphan) == []
-    for image, array in arrays.items():
-        read = features.read(image)
-        assert read.dtype == array.dtype and read.shape == array.shape
-        assert np.array_equal(read, array)
-        assert features.length(image) == (1 if kind == "global_features" else len(array))
-        read[...] = 0  # a copy that the caller may change
-
-
-def test_features_outside_a_kapture_have_the_layout_of_kapture_localization(tmp_path: Path) -> None:
+def test_arrays_outside_a_kapture_read_back_from_the_layout_of_kapture_localization(
+    tmp_path: Path, kind: ArrayKind, config: FeatureConfig, place: str
+) -> None:
     """test_interop.py reads the layout inside a kapture with kapture itself."""
-    with FeatureWriter(tmp_path, "keypoints", "T 1", KEYPOINTS, orphan=True) as writer:
-        writer.write("a/b.jpg", np.zeros((2, 3), np.float32))
-    with FeatureWriter(tmp_path, "global_features", "G", GLOBAL, orphan=True) as writer:
-        writer.write("a/b.jpg", np.zeros((1, 16)))
-    files = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
-    assert files == [
-        "global_features/G/global_features/a/b.jpg.gfeat",
-        "global_features/G/global_features/global_features.txt",
-        "local_features/T 1/keypoints/a/b.jpg.kpt",
-        "local_features/T 1/keypoints/keypoints.txt",
-    ]
+    shape = (config.dsize,) if kind == "global_features" else (5, config.dsize)
+    array = (np.random.default_rng(0).normal(100, 50, shape)).astype(config.dtype)
+    with FeatureWriter(tmp_path, kind, "T 1", config, orphan=True) as writer:
+        assert "b/x 1.jpg" not in writer
+        writer.write("b/x 1.jpg", array)
+        assert "b/x 1.jpg" in writer
+    written = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert written == {f"{place}/{kind}.txt", f"{place}/b/x 1.jpg{SUFFIX[kind]}"}
+    assert list_types(tmp_path, kind, orphan=True) == ["T 1"]
+    assert list_types(tmp_path, kind, orphan=False) == []
+    folder = feature_folder(tmp_path, kind, "T 1", orphan=True)
+    features = pickle.loads(pickle.dumps(FeatureReader(kind, "T 1", [folder])))
+    assert features.config == config and features.names == ["b/x 1.jpg"]
+    read = features.read("b/x 1.jpg")
+    assert read.dtype == array.dtype and np.array_equal(read, array)
+    assert features.length("b/x 1.jpg") == (1 if kind == "global_features" else 5)
+    read[...] = 0  # a copy that the caller may change
 
 
 def test_the_first_of_several_folders_is_used_and_their_configurations_must_agree(

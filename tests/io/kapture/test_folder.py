@@ -13,16 +13,15 @@ from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
-    KaptureData,
     KaptureFolder,
     MatchesWriter,
     Observations,
-    Sensor,
     write_observations,
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
+from tests.worlds import one_camera
 
 FLOAT = np.dtype("float32")
 IMAGES = ("a.jpg", "b/c.jpg")
@@ -32,14 +31,9 @@ IMAGES = ("a.jpg", "b/c.jpg")
 def root(tmp_path: Path) -> Path:
     """A complete small kapture: 2 images with 5 keypoints each, 3 points."""
     root = tmp_path / "map"
-    data = KaptureData(
-        sensors={"cam": Sensor.from_camera(Camera("SIMPLE_PINHOLE", 8, 6, (9, 4, 3)))}
-    )
-    for time, image in enumerate(IMAGES):
-        data.records_camera[time, "cam"] = image
-        data.trajectories[time, "cam"] = RigidTransform.identity()
+    write_sensors(root, one_camera(IMAGES, RigidTransform.identity()))
+    for image in IMAGES:
         write_image(root / "sensors/records_data" / image, np.full((6, 8, 3), 100, np.uint8))
-    write_sensors(root, data)
     with (
         FeatureWriter(root, "keypoints", "T", FeatureConfig("k", FLOAT, 2)) as keypoints,
         FeatureWriter(root, "descriptors", "T", FeatureConfig("d", FLOAT, 4, "T")) as descriptors,

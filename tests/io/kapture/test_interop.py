@@ -23,6 +23,7 @@ from megloc_kapture.io.kapture import (
     MatchesWriter,
     Observations,
     Sensor,
+    points,
     read_pairs,
     write_observations,
     write_pairs,
@@ -198,7 +199,11 @@ def write_theirs(root: Path, *, tar: bool) -> None:
 
 
 @pytest.mark.parametrize("tar", [False, True])
-def test_we_read_files_of_kapture(tmp_path: Path, tar: bool) -> None:
+def test_we_read_files_of_kapture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tar: bool
+) -> None:
+    # observations are read in blocks, here of a row
+    monkeypatch.setattr(points, "_BLOCK_CHARACTERS", 10)
     write_theirs(tmp_path, tar=tar)
     folder = KaptureFolder(tmp_path)
     folder.validate()

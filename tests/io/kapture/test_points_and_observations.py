@@ -1,4 +1,4 @@
-"""3D points, their covariances and observations: round trips."""
+"""3D points and their covariances; test_interop.py has the observations."""
 
 from __future__ import annotations
 
@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 
 from megloc_kapture.io.colmap import load_pycolmap
-from megloc_kapture.io.kapture import points, write_ply
+from megloc_kapture.io.kapture import write_ply
 from megloc_kapture.io.kapture.points import (
     COVARIANCES_FILE,
-    Observations,
-    read_observations,
     read_point_covariances,
     read_points3d,
-    write_observations,
     write_point_covariances,
     write_points3d,
 )
@@ -76,45 +73,3 @@ def test_colmap_reads_the_ply(tmp_path: Path) -> None:
     # COLMAP keeps them in single precision
     np.testing.assert_allclose([point.xyz for point in points], XYZ, rtol=1e-6)
     np.testing.assert_array_equal([point.color for point in points], COLOURS)
-
-
-# -------------------------------------------------------------------------------- observations
-
-
-def plain(observations: dict[str, Observations]) -> dict[str, list[tuple[int, str, int]]]:
-    """Observations as rows of point, image and keypoint."""
-    rows = {}
-    for keypoints_type, of_type in observations.items():
-        assert of_type.keypoints_type == keypoints_type
-        assert list(of_type.image_names) == sorted(set(of_type.image_names))
-        ids = (of_type.point_ids, of_type.image_ids, of_type.keypoint_ids)
-        assert tuple(array.dtype for array in ids) == (np.int64, np.int32, np.int32)
-        rows[keypoints_type] = [
-            (point, of_type.image_names[image], keypoint)
-            for point, image, keypoint in zip(*(array.tolist() for array in ids), strict=True)
-        ]
-        assert {image for _, image, _ in rows[keypoints_type]} == set(of_type.image_names)
-    return rows
-
-
-def random_observations(count: int, keypoints_type: str = "T 1") -> Observations:
-    names = tuple(sorted(f"séquence {i % 3}/{'x' * (i % 40)}{i}.jpg" for i in range(50)))
-    return Observations(
-        keypoints_type,
-        names,
-        np.sort(RNG.integers(0, count, count)),
-        np.r_[np.arange(50), RNG.integers(0, 50, count - 50)].astype(np.int32),
-        np.r_[RNG.integers(0, 2**31, count - 1), 2**31 - 1].astype(np.int32),
-    )
-
-
-def test_observations_read_back_equal_across_borders_of_blocks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(points, "_BLOCK_CHARACTERS", 500)
-    written = {name: random_observations(500, name) for name in ("T 1", "sift")}
-    write_observations(tmp_path, written)
-    path = tmp_path / "reconstruction/observations.txt"
-    read = read_observations(path)
-    assert list(read) == ["T 1", "sift"]
-    assert plain(read) == plain(written)
