@@ -29,9 +29,9 @@ import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.
 
 
 @pytest.fixture
-def own(colmap_room: Path, tmp_path: Path) -> Path:
+def room(colmap_room: Path, tmp_path: Path) -> Path:
     """A copy of the colmap_room that a test may change."""
-    return Path(shutil.copytree(colmap_room, tmp_path / "own", symlinks=True))
+    return Path(shutil.copytree(colmap_room, tmp_path / "room", symlinks=True))
 
 
 def import_colmap(source: ColmapFolders, output: Path) -> dict[str, float]:
@@ -46,8 +46,8 @@ def imported(source: ColmapFolders, output: Path) -> tuple[KaptureFolder, dict[s
     return folder, counts
 
 
-def execute(own: Path, statement: str, *values: Any) -> None:
-    with sqlite3.connect(own / "database.db") as connection:
+def execute(room: Path, statement: str, *values: Any) -> None:
+    with sqlite3.connect(room / "database.db") as connection:
         connection.execute(statement, values)
     connection.close()
 
@@ -152,15 +152,15 @@ def test_without_a_database_features_are_extracted_again(colmap_room: Path, tmp_
     assert folder.descriptors("sift").names == folder.read().image_names()
 
 
-def write_type(own: Path, kind: int, size: int) -> None:
+def write_type(room: Path, kind: int, size: int) -> None:
     """Change the type and size of all descriptors."""
-    with sqlite3.connect(own / "database.db") as connection:
+    with sqlite3.connect(room / "database.db") as connection:
         images = connection.execute("SELECT image_id, rows FROM keypoints").fetchall()
     connection.close()
     for image_id, rows in images:
         content = np.full((rows, size // 4), 0.25, "<f4").tobytes()
         change = "UPDATE descriptors SET type = ?, cols = ?, data = ? WHERE image_id = ?"
-        execute(own, change, kind, size, content, image_id)
+        execute(room, change, kind, size, content, image_id)
 
 
 @pytest.mark.parametrize(
@@ -172,10 +172,10 @@ def write_type(own: Path, kind: int, size: int) -> None:
     ],
 )
 def test_types_of_features_are_named_after_their_extractor(
-    own: Path, tmp_path: Path, kind: Any, local_type: str, dtype: Any, size: int, extractor: Any
+    room: Path, tmp_path: Path, kind: Any, local_type: str, dtype: Any, size: int, extractor: Any
 ) -> None:
-    write_type(own, int(kind), 512)
-    folder, _ = imported(find_colmap(own), tmp_path / "map")
+    write_type(room, int(kind), 512)
+    folder, _ = imported(find_colmap(room), tmp_path / "map")
     config = folder.descriptors(local_type).config
     assert (config.dtype, config.dsize, config.keypoints_type) == (dtype, size, local_type)
     plugin = KaptureMap.open(tmp_path / "map").keypoints[local_type].extractor()
@@ -184,73 +184,73 @@ def test_types_of_features_are_named_after_their_extractor(
         assert plugin.options == {"weights": local_type}
 
 
-def rename(own: Path, names: dict[str, str]) -> None:
+def rename(room: Path, names: dict[str, str]) -> None:
     """Give images of a workspace other names, in all of its parts."""
-    model = pycolmap.Reconstruction(own / "sparse" / "0")
+    model = pycolmap.Reconstruction(room / "sparse" / "0")
     for image in model.images.values():
         if image.name in names:
             new = names[image.name]
-            (own / "images" / new).parent.mkdir(exist_ok=True)
-            (own / "images" / image.name).rename(own / "images" / new)
-            execute(own, "UPDATE images SET name = ? WHERE name = ?", new, image.name)
+            (room / "images" / new).parent.mkdir(exist_ok=True)
+            (room / "images" / image.name).rename(room / "images" / new)
+            execute(room, "UPDATE images SET name = ? WHERE name = ?", new, image.name)
             image.name = new
-    model.write_binary(own / "sparse" / "0")
+    model.write_binary(room / "sparse" / "0")
 
 
-def test_names_that_kapture_cannot_hold_are_changed(own: Path, tmp_path: Path) -> None:
+def test_names_that_kapture_cannot_hold_are_changed(room: Path, tmp_path: Path) -> None:
     names = {"0000.jpg": "my photos/a, b.jpg", "0002.jpg": "#c d.jpg", "0003.jpg": " e.jpg"}
-    rename(own, names)
-    folder, _ = imported(find_colmap(own), tmp_path / "map")
+    rename(room, names)
+    folder, _ = imported(find_colmap(room), tmp_path / "map")
     written = {"my photos/a_ b.jpg": names["0000.jpg"], "_c d.jpg": "#c d.jpg", "_e.jpg": " e.jpg"}
     theirs = kapture.io.csv.kapture_from_dir(str(tmp_path / "map"))
     listed = {name for _, _, name in kapture.flatten(theirs.records_camera)}
     assert listed == set(folder.read().image_names()) and set(written) <= listed
     assert theirs.descriptors is not None and theirs.descriptors["sift"] == listed
     for new, old in written.items():
-        assert folder.image_path(new).samefile(own / "images" / old)
-    rename(own, {names["0000.jpg"]: "a,b.jpg", "0005.jpg": "a_b.jpg"})
+        assert folder.image_path(new).samefile(room / "images" / old)
+    rename(room, {names["0000.jpg"]: "a,b.jpg", "0005.jpg": "a_b.jpg"})
     with pytest.raises(DataError, match=r"'a,b.jpg' and 'a_b.jpg' would both be 'a_b.jpg'"):
-        import_colmap(find_colmap(own), tmp_path / "other")
+        import_colmap(find_colmap(room), tmp_path / "other")
 
 
 def test_images_and_database_are_searched_near_the_model(
-    own: Path, monkeypatch: pytest.MonkeyPatch
+    room: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = own / "sparse" / "0"
-    expected = ColmapFolders(model, own / "images", own / "database.db")
-    for path in (own, own / "sparse", model):
+    model = room / "sparse" / "0"
+    expected = ColmapFolders(model, room / "images", room / "database.db")
+    for path in (room, room / "sparse", model):
         assert is_colmap(path) and find_colmap(path) == expected
-    assert not is_colmap(own / "images") and not is_colmap(own / "none")
+    assert not is_colmap(room / "images") and not is_colmap(room / "none")
     # given folders take precedence
-    (own / "other").mkdir()
-    assert find_colmap(own, images=own / "other") == replace(expected, images=own / "other")
+    (room / "other").mkdir()
+    assert find_colmap(room, images=room / "other") == replace(expected, images=room / "other")
     # the layout of image_undistorter
-    (own / "dense").mkdir()
-    (own / "dense" / "sparse").symlink_to(model)
-    assert find_colmap(own / "dense") == ColmapFolders(own / "dense" / "sparse", None, None)
-    monkeypatch.chdir(own / "sparse")
+    (room / "dense").mkdir()
+    (room / "dense" / "sparse").symlink_to(model)
+    assert find_colmap(room / "dense") == ColmapFolders(room / "dense" / "sparse", None, None)
+    monkeypatch.chdir(room / "sparse")
     relative = find_colmap(Path("0"))
-    assert relative.images is not None and relative.images.samefile(own / "images")
+    assert relative.images is not None and relative.images.samefile(room / "images")
 
 
-def test_ambiguous_and_missing_models_are_refused(own: Path) -> None:
-    model = own / "sparse" / "0"
-    shutil.copytree(model, own / "sparse" / "1")
+def test_ambiguous_and_missing_models_are_refused(room: Path) -> None:
+    model = room / "sparse" / "0"
+    shutil.copytree(model, room / "sparse" / "1")
     for path, given, message in (
-        (own, {}, "several models, give one of them: sparse/0, sparse/1"),
-        (own / "images", {}, "images: no COLMAP model: neither images.bin nor"),
-        (model, {"images": own / "none"}, "none: no such folder of images"),
-        (model, {"database": own / "images"}, "images: no such database"),
+        (room, {}, "several models, give one of them: sparse/0, sparse/1"),
+        (room / "images", {}, "images: no COLMAP model: neither images.bin nor"),
+        (model, {"images": room / "none"}, "none: no such folder of images"),
+        (model, {"database": room / "images"}, "images: no such database"),
     ):
         with pytest.raises(DataError, match=message):
             find_colmap(path, **given)
 
 
-def test_without_features_or_images_the_import_is_refused(own: Path, tmp_path: Path) -> None:
-    source, output = replace(find_colmap(own), database=None), tmp_path / "map"
+def test_without_features_or_images_the_import_is_refused(room: Path, tmp_path: Path) -> None:
+    source, output = replace(find_colmap(room), database=None), tmp_path / "map"
     with pytest.raises(DataError, match="no descriptors .*--database.* or the images .*--images"):
         import_colmap(ColmapFolders(source.model, None, None), output)
-    (own / "images" / "0003.jpg").unlink()
+    (room / "images" / "0003.jpg").unlink()
     message = "images: 1 of the model's 7 images are not here, .* 0003"
     with pytest.raises(DataError, match=message):
         import_colmap(source, output)
@@ -258,11 +258,11 @@ def test_without_features_or_images_the_import_is_refused(own: Path, tmp_path: P
 
 
 def test_a_missing_image_is_tolerated_where_the_database_has_its_features(
-    own: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    before, counts = imported(find_colmap(own), tmp_path / "before")
-    (own / "images" / "0003.jpg").unlink()
-    after, again = imported(find_colmap(own), tmp_path / "map")
+    before, counts = imported(find_colmap(room), tmp_path / "before")
+    (room / "images" / "0003.jpg").unlink()
+    after, again = imported(find_colmap(room), tmp_path / "map")
     assert again == counts
     assert "1 of the model's 7 images are not here, the first is 0003.jpg" in caplog.text
     descriptors = (folder.descriptors("sift").read("0003.jpg") for folder in (before, after))
@@ -270,16 +270,16 @@ def test_a_missing_image_is_tolerated_where_the_database_has_its_features(
 
 
 def test_cameras_and_keypoints_are_scaled_to_smaller_images(
-    own: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    whole, _ = imported(find_colmap(own), tmp_path / "whole")
-    for path in [path for path in (own / "images").rglob("*") if path.is_file()]:
+    whole, _ = imported(find_colmap(room), tmp_path / "whole")
+    for path in [path for path in (room / "images").rglob("*") if path.is_file()]:
         with Image.open(path) as image:
             half = image.resize((image.width // 2, image.height // 2))
         path.unlink()  # may be a link into the shared scene
         half.save(path)
-    halved, _ = imported(find_colmap(own), tmp_path / "half")
-    assert f"{own / 'images'}: 1 cameras are scaled to their images" in caplog.text
+    halved, _ = imported(find_colmap(room), tmp_path / "half")
+    assert f"{room / 'images'}: 1 cameras are scaled to their images" in caplog.text
     name = halved.read().image_names()[0]
     large, small = whole.read().camera_of(name), halved.read().camera_of(name)
     assert (small.width, small.height) == (large.width // 2, large.height // 2)
@@ -288,13 +288,13 @@ def test_cameras_and_keypoints_are_scaled_to_smaller_images(
         halved.keypoints("sift").read(name), whole.keypoints("sift").read(name) / 2
     )
     halved.validate(deep=True)
-    Image.new("RGB", (50, 50)).save(own / "images" / name)
-    with pytest.raises(DataError, match=f"{own}.*{name}.*50x50, its camera says.*--images"):
-        imported(find_colmap(own), tmp_path / "third")
+    Image.new("RGB", (50, 50)).save(room / "images" / name)
+    with pytest.raises(DataError, match=f"{room}.*{name}.*50x50, its camera says.*--images"):
+        imported(find_colmap(room), tmp_path / "third")
 
 
-def test_models_of_other_features_are_refused(own: Path, tmp_path: Path) -> None:
-    source = find_colmap(own)
+def test_models_of_other_features_are_refused(room: Path, tmp_path: Path) -> None:
+    source = find_colmap(room)
     model = pycolmap.Reconstruction(source.model)
     for image in model.images.values():
         for point in image.points2D:
@@ -304,8 +304,8 @@ def test_models_of_other_features_are_refused(own: Path, tmp_path: Path) -> None
         import_colmap(replace(source, database=None), tmp_path / "map")
 
 
-def test_models_without_points_are_refused(own: Path, tmp_path: Path) -> None:
-    source = find_colmap(own)
+def test_models_without_points_are_refused(room: Path, tmp_path: Path) -> None:
+    source = find_colmap(room)
     model = pycolmap.Reconstruction(source.model)
     model.delete_all_points2D_and_points3D()
     model.write_binary(source.model)

@@ -79,10 +79,10 @@ def test_the_used_range_of_deep_images_becomes_8_bits(
 ) -> None:
     Image.fromarray(deep).save(tmp_path / name)
     expected = spread(0, 255)[:, :, None]
-    found = read_image_rgb(tmp_path / name)
-    assert found.dtype == np.uint8 and np.abs(found - expected).max() <= 1.01
+    pixels = read_image_rgb(tmp_path / name)
+    assert pixels.dtype == np.uint8 and np.abs(pixels - expected).max() <= 1.01
     with Image.open(tmp_path / name) as image:
-        assert np.array_equal(pillow_pixels(image), found)
+        assert np.array_equal(pillow_pixels(image), pixels)
     assert capfd.readouterr().err == ""
 
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from aachen_files import MODEL, write_v1_0, write_v1_1
-from kapture import flatten
+from aachen_files import write_v1_0, write_v1_1
 from kapture.io.csv import kapture_from_dir
 from kapture_forms import (
     aachen_with_kapture,
@@ -18,10 +15,9 @@ from kapture_forms import (
     without_images,
 )
 from kloc import kapture_tool
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
-from megloc_kapture.datasets.official import OfficialDataset, write_official
+from megloc_kapture.datasets.official import OfficialDataset
 from megloc_kapture.pipeline.datasets import choose_dataset
 
 PARTS = ("query_day", "query_night")
@@ -88,49 +84,3 @@ def test_the_name_of_the_pose_file_follows_the_version(downloaded: Path, root: P
     assert read(root, version="1.1").protocol.pose_file_stem == "Aachen_v1_1"
     named = root.rename(root.with_name("Aachen-Day-Night-v1.1"))
     assert read(named).protocol.pose_file_stem == "Aachen_v1_1"
-
-
-def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
-    """Return cameras and poses by image, as read by kapture."""
-    data = kapture_from_dir(str(folder))
-    poses = data.trajectories or {}
-    return {
-        name: (data.sensors[sensor].camera_params, poses.get(time, {}).get(sensor))
-        for time, sensor, name in flatten(data.records_camera)
-    }
-
-
-def assert_same_kapture(ours: Path, theirs: Path) -> None:
-    actual, expected = images_of(ours), images_of(theirs)
-    assert actual.keys() == expected.keys() and len(actual) > 2
-    for name, (params, pose) in expected.items():
-        actual_params, actual_pose = actual[name]
-        assert actual_params == params and (actual_pose is None) == (pose is None)
-        if pose is not None:
-            np.testing.assert_allclose(actual_pose.t_raw, pose.t_raw, rtol=0, atol=1e-9)
-            turns = (
-                Rotation.from_quat(one.r_raw, scalar_first=True) for one in (actual_pose, pose)
-            )
-            assert np.degrees((next(turns) * next(turns).inv()).magnitude()) < 1e-9
-
-
-@pytest.fixture
-def sample(shared_data: Path) -> Path:
-    folder = shared_data / "kapture_samples" / "Aachen-Day-Night"
-    if not folder.is_dir():
-        pytest.skip(f"no sample at {folder}")
-    return folder
-
-
-@pytest.mark.slow
-def test_the_published_sample_is_read_as_by_kapture(sample: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    write_official(read(sample), out, allow_missing=True)
-    assert_same_kapture(out / "mapping", sample / "kapture/training")
-    assert_same_kapture(out / "query", sample / "kapture/query")
-    kapture_tool(
-        "kapture_import_nvm",
-        *("-i", sample / MODEL, "-im", sample / "images_upright"),
-        *("-o", tmp_path / "theirs", "--image_transfer", "skip"),
-    )
-    assert_same_kapture(out / "mapping", tmp_path / "theirs")

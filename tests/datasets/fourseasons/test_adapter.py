@@ -36,7 +36,6 @@ from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, LocalFrame,
 from megloc_kapture.datasets.official import Missing, write_official
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io import dataset_tables as tables
-from megloc_kapture.io.kapture import KaptureFolder
 
 
 @pytest.fixture
@@ -181,35 +180,6 @@ def test_recordings_may_have_their_calibration(root: Path) -> None:
     shutil.rmtree(root / DAY / "Calibration")
     with pytest.raises(DataError, match="no folder calibration or Calibration here or in"):
         FourSeasons().check(root)
-
-
-def test_a_folder_without_the_layout_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such folder"):
-        FourSeasons().check(tmp_path / "absent")
-    with pytest.raises(DataError, match="no recording here"):
-        FourSeasons().check(tmp_path)
-    write_calibration(tmp_path / "calibration")
-    write_recording(tmp_path, DAY, (A, B))
-    FourSeasons().check(tmp_path)
-    with pytest.raises(DataError, match="<another recording, for the queries>"):
-        write_official(read(tmp_path), tmp_path / "out")
-    write_official(read(tmp_path), tmp_path / "out", allow_missing=True)
-    assert len(KaptureFolder(tmp_path / "out/mapping").read().poses()) == 4
-
-
-def test_missing_files_are_refused_or_skipped_on_request(root: Path, tmp_path: Path) -> None:
-    for camera in ("cam0", "cam1"):
-        (root / image(DAY, B, camera)).unlink()
-    shutil.rmtree(root / SNOW / "undistorted_images/cam1")
-    dataset = read(root)
-    with pytest.raises(DataError, match=f"4 files are missing: {DAY}/.*{B}.png, .*allow-missing"):
-        write_official(dataset, tmp_path / "out")
-    write_official(dataset, tmp_path / "out", allow_missing=True)
-    assert len(KaptureFolder(tmp_path / "out/mapping").read().poses()) == 2
-    query = KaptureFolder(tmp_path / "out/query").read()
-    assert query.image_names() == [image(SNOW, A + 5), image(SNOW, B + 5)]
-    shutil.rmtree(root / SNOW / "undistorted_images")
-    assert root / SNOW / "undistorted_images/cam0" in missing_of(read(root))
 
 
 # ------------------------------------------------------------------ relocalization challenges

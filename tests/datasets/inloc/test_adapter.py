@@ -201,24 +201,6 @@ def test_layouts_of_redistributions_are_accepted(
     assert mapping.image_path(f"database/cutouts/{name}").resolve() == root / place / name
 
 
-def test_missing_files_are_refused_or_skipped_on_request(root: Path) -> None:
-    cutouts, alignments = root / "database/cutouts", root / "database/alignments"
-    gone = {cutouts / f"DUC1/024/DUC_cutout_024_{name}" for name in ("0_0.jpg.mat", "30_0.jpg")}
-    gone.add(alignments / "DUC2/transformations/DUC_trans_024.txt")
-    for path in gone:
-        path.unlink()
-    dataset = read(root, allow_missing=True)
-    assert dataset.missing is not None and set(dataset.missing.files) == gone
-    with pytest.raises(DataError, match="3 files are missing: .*DUC_trans_024.*--allow-missing"):
-        dataset.missing.refuse()
-    data = dataset.mapping
-    assert {name.split("/")[2] for name in data.image_names()} == {"DUC1"}
-    assert (len(data.records_camera), len(data.records_depth)) == (35, 34)
-    shutil.rmtree(cutouts / "DUC2")
-    missing = read(root).missing
-    assert missing is not None and cutouts / "DUC2" in missing.files
-
-
 def test_a_download_without_points_is_imported_without_depth(root: Path, tmp_path: Path) -> None:
     for path in root.rglob("*.mat"):
         path.unlink()
@@ -226,20 +208,3 @@ def test_a_download_without_points_is_imported_without_depth(root: Path, tmp_pat
         read(root)
     output = imported(root, tmp_path / "out", depth=False)
     assert len(KaptureFolder(output / "mapping").read().poses()) == 72
-
-
-def test_a_folder_without_the_layout_is_refused(tmp_path: Path, root: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    layout = "is missing; InLoc lies as database"
-    InLoc().check(root)
-    for place, gone, message in (
-        (tmp_path / "absent", (), "no such folder"),
-        (tmp_path / "empty", (), f"database/cutouts/ {layout}"),
-        (root, [f"database/cutouts/{floor}" for floor in SCANS], "none of DUC1, DUC2 exists"),
-        (root, ["query"], f"query/iphone7/ {layout}"),
-        (root, ["database/alignments"], f"database/alignments/ {layout}"),
-    ):
-        for folder in gone:
-            shutil.rmtree(root / folder)
-        with pytest.raises(DataError, match=message):
-            InLoc().check(place)

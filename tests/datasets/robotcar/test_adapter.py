@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,12 @@ import pytest
 from robotcar_files import CAMERAS, QUERIES, REFERENCE, TEST, TRAIN, ts, write_layout
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.official import OfficialDataset, write_official
+from megloc_kapture.datasets.official import OfficialDataset
 from megloc_kapture.datasets.robotcar import ImageKey
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.datasets.robotcar.images import rig_of_model
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.dataset_tables import read_groups
-from megloc_kapture.io.kapture import KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 
@@ -179,38 +177,6 @@ def test_additional_truth_is_joined_with_the_public_one(root: Path) -> None:
     # published poses take precedence
     center = truth.poses()[query_name(11)].center()
     np.testing.assert_allclose(center, [11.0, 5.0, -2.0], atol=1e-12)
-
-
-def test_a_folder_without_the_layout_is_refused(tmp_path: Path) -> None:
-    for place in (tmp_path, tmp_path / "nowhere"):
-        for refuse in (RobotCar().check, partial(RobotCar().read, allow_missing=True)):
-            with pytest.raises(DataError, match="not RobotCar Seasons, no folder images and 3D"):
-                refuse(place)
-
-
-@pytest.mark.parametrize(
-    ("gone", "message", "map_images", "queries"),
-    [
-        ("robotcar_v2_train.txt", "robotcar_v2_train.txt", 9, 12),
-        ("intrinsics/left_intrinsics.txt", "intrinsics/left_intrinsics.txt", 6, 8),
-        ("images/night", f"images/night/left/{ts(13)}.jpg", 9, 9),
-        (f"images/overcast-reference/rear/{ts(2)}.jpg", f"rear/{ts(2)}.jpg", 8, 12),
-    ],
-)
-def test_missing_files_are_refused_or_skipped_on_request(
-    root: Path, tmp_path: Path, gone: str, message: str, map_images: int, queries: int
-) -> None:
-    shutil.move(root / gone, tmp_path / "gone")
-    adapter = RobotCar(RobotCarOptions(version=2))
-    with pytest.raises(DataError, match=f"{message}.*--allow-missing"):
-        write_official(adapter.read(root), tmp_path / "out")
-    dataset = adapter.read(root, allow_missing=True)
-    write_official(dataset, tmp_path / "out", allow_missing=True)
-    assert len(dataset.mapping.records_camera) == map_images
-    assert len(dataset.query.records_camera) == queries
-    KaptureFolder(tmp_path / "out/mapping").validate(deep=True)
-    names = {*dataset.mapping.image_names(), *dataset.query.image_names()}
-    assert read_groups(tmp_path / "out/megloc").keys() == names
 
 
 # ------------------------------------------------------------------ the rig of a model's poses

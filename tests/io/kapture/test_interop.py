@@ -81,8 +81,8 @@ def assert_same_sensors(theirs: kapture.Kapture, ours: KaptureData) -> None:
         assert tuple(str(p) for p in theirs.sensors[sensor_id].sensor_params) == sensor.params
         if sensor_id.startswith("cam"):
             assert tuple(theirs.sensors[sensor_id].camera_params[2:]) == sensor.camera().params
-    found = {rig: {s: raw(pose) for s, pose in theirs.rigs[rig].items()} for rig in theirs.rigs}
-    assert found == ours.rigs
+    actual = {rig: {s: raw(pose) for s, pose in theirs.rigs[rig].items()} for rig in theirs.rigs}
+    assert actual == ours.rigs
     poses = theirs.trajectories
     assert {key: raw(poses[key]) for key in poses.key_pairs()} == ours.trajectories
     for records, expected in (
@@ -129,17 +129,17 @@ def test_kapture_reads_our_files(tmp_path: Path) -> None:
         theirs = kapture.io.csv.kapture_from_dir(str(tmp_path), tar_handlers=tars)
         assert_same_sensors(theirs, our_data())
         for kind, by_image in arrays().items():
-            found = getattr(theirs, kind)["T"]
+            features = getattr(theirs, kind)["T"]
             config = CONFIGS[kind]
-            assert set(found) == set(IMAGES)
-            assert (found.type_name, found.dsize) == (config.name, config.dsize)
-            assert found.dtype == config.dtype.type
+            assert set(features) == set(IMAGES)
+            assert (features.type_name, features.dsize) == (config.name, config.dsize)
+            assert features.dtype == config.dtype.type
             path_of = getattr(kapture.io.features, f"get_{kind}_fullpath")
             read = getattr(kapture.io.features, f"image_{kind}_from_file")
             for image, array in by_image.items():
                 path = path_of("T", str(tmp_path), image, tars)
                 assert np.array_equal(
-                    read(path, found.dtype, found.dsize), array.reshape(-1, config.dsize)
+                    read(path, features.dtype, features.dsize), array.reshape(-1, config.dsize)
                 )
         assert theirs.descriptors["T"].keypoints_type == "T"
         assert set(theirs.matches["T"]) == {(IMAGES[0], IMAGES[1])}

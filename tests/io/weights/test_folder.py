@@ -33,21 +33,6 @@ from megloc_kapture.io.weights import (
     weights_folder,
 )
 
-COUNTS = {
-    "aliked-t16": 192_588,
-    "aliked-n16": 678_324,
-    "aliked-n16rot": 678_324,
-    "aliked-n32": 980_468,
-    "xfeat": 1_551_625,
-    "r2d2_WAF_N16": 485_803,
-    "r2d2_WASF_N16": 485_803,
-    "r2d2_WASF_N8_big": 1_041_019,
-    "espnetv2-cityscapes": 247_279,
-    "lpips-alex": 1_152,
-    "lpips-vgg": 1_472,
-    "lpips-squeeze": 2_240,
-}
-
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -73,17 +58,16 @@ def write(path: Path, value: float = 1.0) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", COUNTS)
-def test_published_files_are_read_whole(
+@pytest.mark.parametrize("name", ["aliked-t16", "xfeat", "r2d2_WAF_N16"])
+def test_published_files_have_the_size_and_sha256_of_the_registry(
     published: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(published))
     file = find_weights(name)
-    tensors = read_weights(file)
-    assert sum(tensor.numel() for tensor in tensors.values()) == COUNTS[name]
-    assert not any(key.startswith("module.") for key in tensors)
     assert file.published is not None and file.published.sha256 == sha256_of(file)
     assert file.published.size == file.size == file.path.stat().st_size
+    # R2D2's names have a prefix of torch's DataParallel
+    assert not any(key.startswith("module.") for key in read_weights(file))
 
 
 def test_the_folder_is_set_by_the_environment(
