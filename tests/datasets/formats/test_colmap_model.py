@@ -124,21 +124,6 @@ def test_a_wrong_text_model_is_named(
     assert str(caught.value).startswith(str(tmp_path))
 
 
-def test_rigs_have_the_cameras_whose_pose_is_known(tmp_path: Path) -> None:
-    rig = pycolmap.Rig(rig_id=7)
-    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1))
-    rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 2), None)
-    rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.IMU, 3), pycolmap.Rigid3d())
-    written = pycolmap.Reconstruction()
-    for camera_id in (1, 2):
-        camera = {"model": "PINHOLE", "width": 4, "height": 4, "params": [4] * 4}
-        written.add_camera(pycolmap.Camera(camera_id=camera_id, **camera))
-    written.add_rig(rig)
-    written.write_binary(tmp_path)
-    assert list(read_colmap_model(tmp_path).cams_from_rig[7]) == [1]
-    assert len(colmap_model_files(tmp_path)) == 5
-
-
 @pytest.mark.parametrize(
     ("model", "params"),
     [

@@ -196,7 +196,7 @@ def many_keyframes(root: Path, count: int) -> list[int]:
     [
         (DAY, SNOW, f"relocalizationFile_{DAY}_to_{SNOW}.txt"),
         ("loop_2_train", "loop_2_test", "reloc_loop_2_train_to_loop_2_test.txt"),
-        (DAY, SNOW, f"{DAY}/relocalizationFile_{SNOW}.txt"),
+        (DAY, SNOW, f"{DAY}/RelocalizationFilesTest/relocalizationFile_{SNOW}_hard.txt"),
     ],
 )
 def test_relocalization_files_select_images_and_priors(
