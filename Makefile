@@ -66,10 +66,10 @@ SLOW_WORKERS = $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
 IN_MEMORY = $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 4e6 { print "PYTEST_DEBUG_TEMPROOT=/dev/shm" }')
 
 test: $(STAMP)
-	@$(IN_MEMORY) $(PYTEST) -n logical -m 'not slow and not fuzz' $(ARGS)
+	@$(IN_MEMORY) $(PYTEST) -n logical -m 'not slow' $(ARGS)
 
 test-slow: $(STAMP)
-	@$(PYTEST) -n $(SLOW_WORKERS) -m 'slow or fuzz' --no-loadscope-reorder --hypothesis-profile thorough \
+	@$(PYTEST) -n $(SLOW_WORKERS) -m slow --no-loadscope-reorder --hypothesis-profile thorough \
 		$(if $(BUDGET_S),--time-budget-s '$(BUDGET_S)') $(ARGS)
 
 test-all: $(STAMP)

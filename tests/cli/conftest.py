@@ -1,4 +1,4 @@
-"""A small scene, a finished run of it, and the command as its users meet it."""
+"""A small scene, a finished run of it, and the command."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SMALL = ("--set", "local_features.options.max_keypoints=800")
 
 @dataclass(frozen=True)
 class Done:
-    """How a command ended, and what it printed."""
+    """Exit status and output of a command."""
 
     status: int
     out: str
     err: str
 
     def refused(self, *patterns: str) -> str:
-        """Check that it is a user's error, told in one line that has all the patterns in it."""
+        """Check that a user error is printed in a single line that matches all patterns."""
         assert self.status == 2, self
         assert self.out == "", self.out
         lines = self.err.splitlines()
@@ -44,7 +44,7 @@ Command = Callable[..., Done]
 
 @pytest.fixture
 def megloc(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs our command in this process."""
+    """Run the command in this process."""
 
     def run(*arguments: str | Path) -> Done:
         capsys.readouterr()
@@ -59,7 +59,7 @@ def megloc(capsys: pytest.CaptureFixture[str]) -> Command:
 
 @pytest.fixture(scope="session")
 def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Workspace of a finished, undisturbed run on one core; not to be written into."""
+    """Workspace of a finished run in this process; read only."""
     workspace = tmp_path_factory.mktemp("finished") / "workspace"
     places = ["--root", str(scene), "--workspace", str(workspace)]
     with pytest.raises(SystemExit) as end:
@@ -70,25 +70,25 @@ def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def dataset(scene: Path, tmp_path: Path) -> Path:
-    """A copy of the scene, to be spoilt."""
+    """A copy of the scene that a test may change."""
     return copy_of(scene, tmp_path / "dataset")
 
 
 @pytest.fixture
 def workspace(finished: Path, tmp_path: Path) -> Path:
-    """A copy of the finished workspace, to be worked on."""
+    """A copy of the finished workspace that a test may change."""
     return copy_of(finished, tmp_path / "workspace")
 
 
 @pytest.fixture(scope="session")
 def virtual_gallery(shared_data: Path) -> Path:
-    """A real map of another tool: map/, query/ and query_gt/; not to be written into."""
+    """A real map of another tool: map/, query/ and query_gt/; read only."""
     return shared_data / "foreign_maps" / "virtual_gallery"
 
 
 @pytest.fixture(scope="session")
 def foreign_map(finished: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small scene as another tool's map: map/, query/, query_gt/; not to be written into."""
+    """The small scene as the map of another tool: map/, query/, query_gt/; read only."""
     root = tmp_path_factory.mktemp("foreign")
     write_foreign(root, finished, scene)
     return root
@@ -96,40 +96,40 @@ def foreign_map(finished: Path, scene: Path, tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture
 def foreign(foreign_map: Path, tmp_path: Path) -> Path:
-    """A copy of it whose images are links; to be spoilt."""
+    """A copy of the foreign map, with links to its images."""
     return copy_of(foreign_map, tmp_path / "foreign")
 
 
 def copy_of(folder: Path, place: Path) -> Path:
-    """A copy in which links stay links."""
+    """Copy a folder; links stay links."""
     shutil.copytree(folder, place, symlinks=True)
     return place
 
 
 @pytest.fixture(scope="session")
 def contents() -> Callable[[Path], dict[str, bytes]]:
-    """Function: path below a folder -> bytes, of all files and of what links say."""
+    """Function: contents of files and targets of links below a folder, by relative path."""
 
     def read(root: Path) -> dict[str, bytes]:
-        found = {}
+        files = {}
         for path in sorted(root.rglob("*")):
             if path.is_symlink():
-                found[str(path.relative_to(root))] = bytes(path.readlink())
+                files[str(path.relative_to(root))] = bytes(path.readlink())
             elif path.is_file():
-                found[str(path.relative_to(root))] = path.read_bytes()
-        return found
+                files[str(path.relative_to(root))] = path.read_bytes()
+        return files
 
     return read
 
 
 @pytest.fixture(scope="session")
 def data_of() -> Callable[[Path], dict[str, Any]]:
-    """Function: what a page of ``megloc view`` shows."""
+    """Function: the data of a page of ``megloc view``."""
 
     def read(page: Path) -> dict[str, Any]:
-        found = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
-        assert found is not None
-        data: dict[str, Any] = json.loads(found[1])
+        content = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
+        assert content is not None
+        data: dict[str, Any] = json.loads(content[1])
         return data
 
     return read

@@ -1,4 +1,4 @@
-"""A map and queries as another tool leaves them: they bring features that are not ours by name."""
+"""A map and queries of another tool, with features whose names are not ours."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FOREIGN_MAPS = ["foreign_map", pytest.param("virtual_gallery", marks=pytest.mark
 def write_foreign(root: Path, finished: Path, scene: Path) -> None:
     """Write ``map/``, ``query/`` and ``query_gt/`` from a finished run of the scene.
 
-    What is stored as R2D2's and AP-GeM's is RootSIFT's and VLAD's. Images are links.
+    RootSIFT is stored under the name R2D2, VLAD under AP-GeM. Images are links.
     """
     shutil.copytree(scene / "query_gt", root / "query_gt")
     no_images = shutil.ignore_patterns("records_data")
@@ -52,7 +52,7 @@ def _write_features(root: Path, folder: KaptureFolder, kind: str) -> None:
 
 
 def rename_type(root: Path) -> None:
-    """The type of the keypoints becomes ``orb_800``, which no extractor makes."""
+    """Rename the type of the keypoints to ``orb_800``, which has no extractor."""
     for part in ("map", "query"):
         for kind in (KEYPOINTS, DESCRIPTORS):
             folder = root / part / kind

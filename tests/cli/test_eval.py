@@ -1,10 +1,9 @@
-"""``megloc eval``: what runs again and what does not, and that the result is always the same."""
+"""``megloc eval``: the workspace, repeated runs, parts of a run, failed queries."""
 
 from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,31 +13,25 @@ import numpy as np
 import pytest
 from aachen_files import write_v1_0
 
-from megloc_kapture.io.images import write_depth_map, write_image
-from megloc_kapture.io.kapture import KaptureFolder, Sensor, read_pairs, write_sensors
+from megloc_kapture.io.images import write_image
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs, write_sensors
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.values import RigidTransform
-
-Contents = Callable[[Path], dict[str, bytes]]
 
 STAGES = (
     *("import", "local_features", "global_features", "mapping_pairs", "mapping_matches", "map"),
     *("query_pairs", "query_matches", "localization", "submission", "evaluation"),
 )
 POSES = "submissions/kapture_eval_megloc-classic.txt"
-# dates and durations stand in these, and nowhere else
-DATED = ("stages/", "timing.csv")
 
 
 @pytest.fixture
 def evaluate(megloc: Any) -> Callable[..., Any]:
-    """Runs ``megloc eval kapture`` as the finished run was."""
+    """Run ``megloc eval kapture`` with the options of the finished run."""
 
     def run(root: Path, workspace: Path, *arguments: str, status: int = 0) -> Any:
         done = megloc(
             *("eval", "kapture", "--root", root, "--workspace", workspace),
-            *("--set", "local_features.options.max_keypoints=800"),
-            *(() if "--executor" in arguments else ("--executor", "inline")),
+            *("--set", "local_features.options.max_keypoints=800", "--executor", "inline"),
             *arguments,
         )
         assert done.status == status, done.err
@@ -48,79 +41,26 @@ def evaluate(megloc: Any) -> Callable[..., Any]:
 
 
 def states(err: str) -> dict[str, str]:
-    """Stage -> what the last line about it says, of those that have one."""
-    told = dict(line.split(": ", 1) for line in err.splitlines() if ": " in line)
-    return {stage: told[stage] for stage in STAGES if stage in told}
+    """Return the last printed state of each stage."""
+    printed = dict(line.split(": ", 1) for line in err.splitlines() if ": " in line)
+    return {stage: printed[stage] for stage in STAGES if stage in printed}
 
 
 def ran(err: str) -> list[str]:
-    """The stages that have been run."""
-    return [stage for stage, told in states(err).items() if told.endswith(" s")]
+    """Return the stages with a printed duration: they were run."""
+    return [stage for stage, state in states(err).items() if state.endswith(" s")]
 
 
 def reasons(err: str) -> dict[str, str]:
-    """Why a stage was run, as told before it was."""
-    found: dict[str, str] = {}
-    for line in err.splitlines():
-        place, _, told = line.partition(": ")
-        stage, _, numbered = place.partition(", stage ")
-        if stage in STAGES:
-            assert not numbered or re.fullmatch(r"\d+ of \d+", numbered)
-            found.setdefault(stage, told)
-    return found
+    """Return the reason that is printed before a stage runs."""
+    printed = re.findall(r"^(\w+), stage \d+ of \d+: (.*)$", err, re.MULTILINE)
+    return dict(reversed(printed))
 
 
-def lasting(found: dict[str, bytes], *but: str) -> dict[str, bytes]:
-    """What has to be the same in every run."""
-    return {n: c for n, c in found.items() if not n.startswith((*DATED, *but))}
+# ------------------------------------------------------------------ the workspace
 
 
-def recall(workspace: Path) -> list[float]:
-    """Of all queries, at each threshold."""
-    rows = json.loads((workspace / "evaluation" / "recall.json").read_text())["rows"]
-    (row,) = (row for row in rows if row["name"] == "all")
-    return [at["recall"] for at in row["recall"]]
-
-
-# ------------------------------------------------------------------ what is there at the end
-
-
-def test_the_pose_file_of_each_result_is_among_the_submissions(
-    megloc: Any, scene: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (workspace.parent / "runs").mkdir()
-    run = workspace.rename(workspace.parent / "runs" / f"kapture-{scene.name}-classic")
-    monkeypatch.chdir(workspace.parent)
-    command = ("eval", "kapture", "--root", scene, "--executor", "inline")
-    same = ("--set", "local_features.options.max_keypoints=800")
-    other = (*same, "--set", "localization.pose.max_error_px=6")
-    first, second = Path(POSES), Path(POSES.replace(".txt", "-2.txt"))
-    done = megloc(*command, *same)
-    assert "nothing to do" in done.err and f"pose file  {first}\n" in done.out
-    poses = first.read_bytes()
-    assert poses == (run / POSES).read_bytes()
-    assert Path(f"{POSES}.json").read_bytes() == (run / f"{POSES}.json").read_bytes()
-    until = ("--until", "submission")  # it is said without the evaluation as well
-    done = megloc(*command, *other, *until)
-    assert f"{first} belongs to another result and is kept" in done.err
-    assert f"pose file  {second}\n" in done.out
-    assert first.read_bytes() == poses != second.read_bytes() == (run / POSES).read_bytes()
-    # back again, and into a folder of one's own
-    assert f"pose file  {first}\n" in megloc(*command, *same, *until).out
-    assert len(list(Path("submissions").iterdir())) == 4
-    done = megloc(*command, *same, "--workspace", run, "--submissions", "mine")
-    assert done.out.splitlines()[-2] == f"pose file  {Path('mine') / first.name}"
-    (run / POSES).unlink()
-    assert megloc(*command, *same, "--workspace", run).status == 0  # nobody asked for a copy
-    done = megloc(*command, *same, *until, "--workspace", run, "--submissions", "kept")
-    assert done.status == 2 and "no such file; --from submission writes it again" in done.err
-    again = ("--from", "submission", *until, "--workspace", run, "--submissions", "kept")
-    done = megloc(*command, *same, *again)
-    assert done.out == f"pose file  {Path('kept') / first.name}\n"
-    assert not done.err.count("evaluation")
-
-
-def test_the_workspace_has_what_is_promised(finished: Path, scene: Path) -> None:
+def test_the_workspace_has_the_documented_files(finished: Path, scene: Path) -> None:
     for place in (
         *("mapping", "query", "query_gt", "megloc/protocol.json", "map", "localized"),
         *("local_features/rootsift/keypoints/keypoints.txt", "pairs/mapping.txt"),
@@ -141,125 +81,93 @@ def test_the_workspace_has_what_is_promised(finished: Path, scene: Path) -> None
         link = finished / part / "sensors" / "records_data"
         assert link.readlink() == scene.resolve() / part / "sensors" / "records_data"
     assert [p for p in finished.rglob("*.jpg") if not p.is_symlink() and p.is_file()] == []
-    # all queries are localized well
-    assert recall(finished) == [1.0] * 4
+
+
+def test_all_queries_of_the_small_scene_are_localized(finished: Path) -> None:
+    rows = json.loads((finished / "evaluation" / "recall.json").read_text())["rows"]
+    (row,) = (row for row in rows if row["name"] == "all")
+    assert [at["recall"] for at in row["recall"]] == [1.0] * 4
     statuses = read_status(finished / "localized" / "status.csv")
     assert len(statuses) == 4
     assert all(s.status == "localized" and s.fallback == "none" for s in statuses.values())
-    # a manifest says what was done
-    manifest = json.loads((finished / "stages" / "local_features.json").read_text())
-    choice = {"name": "rootsift", "options": {"max_keypoints": 800}}
-    assert manifest["options"]["local_features"] == [choice]
-    assert manifest["counts"]["images"] == 11
-    code = "code of megloc_kapture.features.rootsift.RootSift"
-    assert set(manifest["inputs"]) == {"import", code}
-    assert manifest["seconds"] > 0 and manifest["versions"]["pycolmap"]
 
 
-def test_where_query_poses_are_given_no_stage_sees_them(
-    evaluate: Any, dataset: Path, finished: Path
+def test_the_pose_file_is_copied_to_the_folder_of_submissions(
+    evaluate: Any, scene: Path, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shutil.copyfile(
-        dataset / "query_gt/sensors/trajectories.txt", dataset / "query/sensors/trajectories.txt"
-    )
-    evaluate(dataset, dataset.parent / "run", "--until", "import")
-    assert KaptureFolder(dataset.parent / "run" / "query").read().poses() == {}
-    assert not (dataset.parent / "run" / "local_features").exists()
+    monkeypatch.chdir(tmp_path)
+    until = ("--until", "submission", "--submissions", "kept")
+    copy = Path("kept") / Path(POSES).name
+    assert evaluate(scene, workspace, *until).out == f"pose file  {copy}\n"
+    first = copy.read_bytes()
+    assert first == (workspace / POSES).read_bytes()
+    assert Path(f"{copy}.json").read_bytes() == (workspace / f"{POSES}.json").read_bytes()
+    done = evaluate(scene, workspace, *until, "--set", "localization.pose.max_error_px=6")
+    assert f"{copy} belongs to another result and is kept" in done.err
+    assert f"pose file  {str(copy).replace('.txt', '-2.txt')}\n" in done.out
+    assert copy.read_bytes() == first
 
 
-# ------------------------------------------------------------------ again
+# ------------------------------------------------------------------ repeated runs
 
 
-def test_the_second_run_does_nothing_and_says_so(
-    evaluate: Any, scene: Path, workspace: Path, contents: Contents
+def test_the_second_run_does_nothing_and_prints_the_result(
+    evaluate: Any, scene: Path, workspace: Path, contents: Callable[[Path], dict[str, bytes]]
 ) -> None:
-    def times() -> dict[str, int]:
-        paths = (path for path in workspace.rglob("*") if not path.is_symlink())
-        return {str(p): p.stat().st_mtime_ns for p in paths}
-
-    before, files = times(), contents(workspace)
-    del before[str(workspace / "stages")]
+    before = contents(workspace)
+    times = {path: path.stat().st_mtime_ns for path in workspace.rglob("*") if path.is_file()}
     done = evaluate(scene, workspace)
     assert states(done.err) == dict.fromkeys(STAGES, "up to date")
     assert "nothing to do: every stage is up to date" in done.err
     assert "pose file" in done.out and "100.0" in done.out
-    after = times()
-    del after[str(workspace / "stages")]
-    assert after == before
-    assert contents(workspace) == files
+    assert contents(workspace) == before
+    assert {path: path.stat().st_mtime_ns for path in times} == times
 
 
-def test_an_option_of_localization_reruns_what_follows_only(
+def test_a_changed_option_repeats_the_stages_that_depend_on_it(
     evaluate: Any, scene: Path, workspace: Path
 ) -> None:
-    done = evaluate(scene, workspace, "--set", "localization.pose.max_error_px=6")
-    assert ran(done.err) == ["localization", "submission", "evaluation"]
-    assert reasons(done.err)["localization"] == ("options changed: localization.pose.max_error_px")
-    assert reasons(done.err)["evaluation"] == "localization changed"
-    # and back again
     until = ("--until", "submission")
-    assert ran(evaluate(scene, workspace, *until).err) == ["localization", "submission"]
-    # thresholds are written by the import, and change nothing before the submission
+    done = evaluate(scene, workspace, *until, "--set", "localization.pose.max_error_px=6")
+    assert ran(done.err) == ["localization", "submission"]
+    assert reasons(done.err)["localization"] == "options changed: localization.pose.max_error_px"
+    assert reasons(done.err)["submission"] == "localization changed"
+
+
+def test_changed_thresholds_repeat_neither_the_map_nor_the_localization(
+    evaluate: Any, scene: Path, workspace: Path
+) -> None:
     done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5")
     assert ran(done.err) == ["import", "submission", "evaluation"]
     assert reasons(done.err)["import"] == "options changed: protocol.thresholds"
 
 
-def test_a_changed_image_reruns_everything_and_a_moved_dataset_the_import(
-    evaluate: Any, dataset: Path, finished: Path
+def test_a_moved_dataset_repeats_the_import_and_a_changed_image_the_features(
+    evaluate: Any, dataset: Path, tmp_path: Path
 ) -> None:
-    run, image = dataset.parent / "run", dataset / "mapping/sensors/records_data/0005.jpg"
-    until = ("--until", "localization")
-    evaluate(dataset, run, *until)
+    until = ("--until", "local_features")
+    evaluate(dataset, tmp_path / "run", *until)
     moved = dataset.rename(dataset.with_name("moved"))
-    assert ran(evaluate(moved, run, *until).err) == ["import"]
-    moved.rename(dataset)
-    with open(image, "ab") as file:
+    assert ran(evaluate(moved, tmp_path / "run", *until).err) == ["import"]
+    with open(moved / "mapping/sensors/records_data/0005.jpg", "ab") as file:
         file.write(b"\0")
-    done = evaluate(dataset, run, *until)
-    assert ran(done.err) == list(STAGES[:9])
+    done = evaluate(moved, tmp_path / "run", *until)
+    assert ran(done.err) == ["import", "local_features"]
     assert reasons(done.err)["import"] == "dataset files changed"
-    # its pixels are the same
-    poses = "localized/sensors/trajectories.txt"
-    assert (run / poses).read_bytes() == (finished / poses).read_bytes()
 
 
 # ------------------------------------------------------------------ parts of a run
 
 
-def test_import_options_are_those_of_the_dataset(megloc: Any, tmp_path: Path) -> None:
-    version = ("--root", write_v1_0(tmp_path / "root"), "--import-option", "version=1.1")
-    done = megloc("eval", "aachen", *version, "-w", tmp_path / "run", "--dry-run")
+def test_import_options_reach_the_dataset(megloc: Any, tmp_path: Path) -> None:
+    command = ("eval", "aachen", "--root", write_v1_0(tmp_path / "root"), "-w", tmp_path / "run")
+    done = megloc(*command, "--import-option", "version=1.1", "--dry-run")
     assert done.status == 2 and "the model of Aachen Day-Night v1.1 is missing" in done.err
-    done = megloc("eval", "aachen", "--root", tmp_path / "root", "--import-option", "version")
+    done = megloc(*command, "--import-option", "version")
     assert done.status == 2 and "--import-option takes key=value" in done.err
 
 
-def test_queries_with_depth_are_refined_and_others_are_not(
-    evaluate: Any, dataset: Path, tmp_path: Path
-) -> None:
-    assert "refine_poses" not in evaluate(dataset, tmp_path / "run", "--dry-run").err
-    folder = KaptureFolder(dataset / "query")
-    data = folder.read()
-    (timestamp, camera), *_ = data.records_camera
-    depth = Sensor.from_camera(data.sensors[camera].camera(), name="tof", sensor_type="depth")
-    rig = {sensor: RigidTransform.identity() for sensor in (camera, "tof")}
-    with_depth = replace(
-        data,
-        sensors={**data.sensors, "tof": depth},
-        rigs={"rig": rig},
-        records_depth={(timestamp, "tof"): "a.depth"},
-    )
-    write_sensors(dataset / "query", with_depth)
-    size = depth.camera()
-    write_depth_map(folder.depth_path("a.depth"), np.ones((size.height, size.width)))
-    told = evaluate(dataset, tmp_path / "run", "--dry-run").err.splitlines()
-    assert "refine_poses: would run (not done yet)" in told
-    off = evaluate(dataset, tmp_path / "run", "--dry-run", "--set", "pose_refinement.by=[]")
-    assert "refine_poses" not in off.err
-
-
-def test_from_takes_what_another_tool_put_there(
+def test_from_uses_files_of_another_tool_as_they_are(
     evaluate: Any, scene: Path, workspace: Path
 ) -> None:
     pairs = read_pairs(workspace / "pairs" / "query.txt")
@@ -270,51 +178,51 @@ def test_from_takes_what_another_tool_put_there(
     assert ran(done.err) == list(STAGES[7:9])
     assert set(map(states(done.err).get, STAGES[:6])) == {"taken as it is"}
     statuses = read_status(workspace / "localized" / "status.csv")
-    assert {q: s.candidates for q, s in statuses.items()} == {
-        query: (image,) for query, image in nearest.items()
-    }
-
-
-# ------------------------------------------------------------------ the same bytes
-
-
-def test_processes_give_the_same_bytes(
-    evaluate: Any, scene: Path, finished: Path, tmp_path: Path, contents: Contents
-) -> None:
-    evaluate(scene, tmp_path / "run", "--executor", "processes", "--workers", "2")
-    expected, found = lasting(contents(finished)), lasting(contents(tmp_path / "run"))
-    for folder in ("local_features", "map", "localized", "submissions", "evaluation"):
-        assert any(name.startswith(f"{folder}/") for name in expected)
-    assert found == expected
+    candidates = {query: (image,) for query, image in nearest.items()}
+    assert {query: status.candidates for query, status in statuses.items()} == candidates
 
 
 # ------------------------------------------------------------------ results
 
 
-def test_queries_that_fail_are_misses_and_low_recall_fails_when_asked_for(
+def add_query(dataset: Path, name: str) -> None:
+    """Add a query that shows noise, listed as an image of another location."""
+    data = KaptureFolder(dataset / "query").read()
+    time, sensor = data.record_of(data.image_names()[-1])
+    data.records_camera[time + 1000, sensor] = name
+    write_sensors(dataset / "query", data)
+    coarse = np.random.default_rng(0).integers(0, 255, (38, 50, 3), dtype=np.uint8)
+    noise = np.kron(coarse, np.ones((8, 8, 1), np.uint8))[:300, :400]
+    write_image(dataset / "query/sensors/records_data" / name, noise)
+    (dataset / "query_gt" / "nowhere.txt").write_text(f"{name}\n")
+
+
+def test_failed_queries_are_misses_and_a_rejected_stranger_is_correct(
     evaluate: Any, dataset: Path, finished: Path
 ) -> None:
     images = dataset / "query/sensors/records_data"
     (images / "0004.jpg").write_bytes((images / "0004.jpg").read_bytes()[:20_000])
     write_image(images / "0007.jpg", np.zeros((100, 200, 3), np.uint8))
     (images / "0010.jpg").unlink()
+    add_query(dataset, "stranger.png")
     run = dataset.parent / "run"
     done = evaluate(dataset, run, "--fail-below", "0.3", status=3)
     assert "recall 0.250 is below 0.300" in done.err
     assert evaluate(dataset, run, "--fail-below", "0.25").status == 0
     statuses = read_status(run / "localized" / "status.csv")
-    failed = {name: one.reason for name, one in statuses.items() if one.status == "failed"}
-    assert set(statuses) - set(failed) == {"0001.jpg"}
-    assert set(failed) == {"0004.jpg", "0007.jpg", "0010.jpg"}
-    assert all(one.startswith("the image cannot be used: ") for one in failed.values())
+    failed = {name: s.reason for name, s in statuses.items() if s.status == "failed"}
+    assert set(failed) == {"0004.jpg", "0007.jpg", "0010.jpg", "stranger.png"}
+    assert failed["0007.jpg"].startswith("the image cannot be used: ")
     assert "200x100, its camera says 400x300" in failed["0007.jpg"]
-    # they are not in the pose file, and the other one does not mind
+    text = " ".join((run / "evaluation" / "recall.txt").read_text().split())
+    assert "1 query shows nothing of the map: 1 refused, 0 given a pose" in text
+    # the localized query has the same pose as without the failed ones
     expected = (finished / POSES).read_text().splitlines(keepends=True)
     assert (run / POSES).read_text() == "".join(r for r in expected if "0001" in r)
 
 
 def test_inverted_poses_are_refused_unless_forced(
-    evaluate: Callable[..., Any], dataset: Path, tmp_path: Path
+    evaluate: Any, dataset: Path, tmp_path: Path
 ) -> None:
     folder = KaptureFolder(dataset / "mapping")
     data = folder.read()

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from colmap_workspace import write_workspace
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.kapture import KaptureFolder
@@ -24,7 +23,9 @@ def check(result: Path, scene: Path) -> None:
     assert row.median_position_m is not None and row.median_position_m < 0.01
 
 
-def test_two_commands_to_poses(megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path) -> None:
+def test_an_imported_model_is_localized_in(
+    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path
+) -> None:
     done = megloc("import", "colmap", colmap_room, "-o", tmp_path / "map")
     assert done.status == 0 and "observations" in done.out, done
     assert f"database: {colmap_room}/database.db" in done.err
@@ -34,20 +35,27 @@ def test_two_commands_to_poses(megloc: Any, colmap_room: Path, scene: Path, tmp_
     check(tmp_path / "localized", scene)
 
 
-def test_a_model_is_taken_for_a_map(
-    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_model_is_imported_to_the_cache_where_a_map_is_expected(
+    megloc: Any, colmap_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     model = colmap_room / "sparse" / "0"
-    queries = ("--query", scene / "query", "-o", tmp_path / "localized")
-    done = megloc("localize", "-i", model, *queries)
+    done = megloc("info", model)
     assert f"{model}: a COLMAP model, as kapture in {tmp_path}/cache/" in done.err
-    check(tmp_path / "localized", scene)
-    told = megloc("info", model).out
-    assert "7 (7 PINHOLE), 7 with a pose" in told and "extracted by plugin sift" in told
+    assert "7 (7 PINHOLE), 7 with a pose" in done.out and "extracted by plugin sift" in done.out
 
 
-def test_poses_alone_become_a_kapture(
+@pytest.mark.parametrize(
+    ("unit", "printed"), [((), "units of the map"), (("--unit", "m"), "metres")]
+)
+def test_the_unit_of_a_model_is_unknown_unless_given(
+    megloc: Any, colmap_room: Path, tmp_path: Path, unit: tuple[str, ...], printed: str
+) -> None:
+    assert megloc("import", "colmap", colmap_room, "-o", tmp_path / "map", *unit).status == 0
+    assert f"unit              {printed}" in megloc("info", tmp_path / "map").out
+
+
+def test_a_model_of_poses_alone_without_images_is_imported_as_poses(
     megloc: Any, colmap_room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     model = pycolmap.Reconstruction(str(colmap_room / "sparse" / "0"))
@@ -62,48 +70,14 @@ def test_poses_alone_become_a_kapture(
         np.testing.assert_allclose(poses[image.name].matrix()[:3], expected, atol=1e-9)
 
 
-def write_poses(folder: Path, colmap_room: Path, matrices: dict[str, np.ndarray]) -> None:
-    """Write a COLMAP model of poses alone, beside the room's images."""
-    (folder / "sparse").mkdir(parents=True)
-    (folder / "images").symlink_to(colmap_room / "images")
-    pycolmap.Reconstruction(colmap_room / "sparse" / "0").write_text(folder / "sparse")
-    for name in ("points3D.txt", "frames.txt", "rigs.txt"):
-        (folder / "sparse" / name).unlink()
-    (folder / "sparse" / "points3D.txt").touch()
-    lines = []
-    for number, (name, matrix) in enumerate(matrices.items(), start=1):
-        x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
-        tx, ty, tz = matrix[:3, 3].tolist()
-        lines.append(f"{number} {w} {x} {y} {z} {tx} {ty} {tz} 1 {name}\n\n")
-    (folder / "sparse" / "images.txt").write_text("".join(lines))
-
-
-def test_poses_in_another_convention(
-    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path
-) -> None:
-    poses = KaptureFolder(scene / "mapping").read().poses()
-    opengl = np.diag([1.0, -1.0, -1.0, 1.0])
-    given = {name: np.linalg.inv(opengl @ pose.matrix()) for name, pose in poses.items()}
-    write_poses(tmp_path / "wrong", colmap_room, given)
-    arguments = ("import", "colmap", tmp_path / "wrong", "-o", tmp_path / "map")
-    done = megloc(*arguments)
-    assert done.status == 2 and not (tmp_path / "map").exists()
-    (line,) = (line for line in done.err.splitlines() if line.startswith("megloc:"))
-    assert f"{tmp_path}/wrong/sparse: the given poses contradict the matches" in line
-    assert "poses inverted and with OpenGL's axes (camera-to-world, y up, z back)" in line
-    done = megloc(*arguments, "-f")
-    assert done.status == 0 and "observations" in done.out, done
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "local_type"), [(None, "sift"), ("ALIKED_N16ROT", "aliked-n16rot")]
 )
-def test_photographs(
+def test_a_model_of_surveyed_photographs_is_localized_in(
     megloc: Any, shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     kind: str | None, local_type: str,
 ) -> None:  # fmt: skip
-    """Surveyed poses, COLMAP's points: of its SIFT, and of the networks whose features it has."""
     scene = shared_data / "scenes" / "fountain_p11"
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(shared_data / "weights"))
     extractor = None

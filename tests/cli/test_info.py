@@ -1,4 +1,4 @@
-"""``megloc info``: what a map is, and what it allows."""
+"""``megloc info``: content of a map, and the ways to localize in it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 
 
 def described(out: str) -> dict[str, str]:
-    """First column to the rest, of the lines that have one."""
+    """Return the first column of each line with the rest of the line."""
     return dict(re.findall(r"^(\w[\w ]*?)  +(.*)$", out, re.MULTILINE))
 
 
@@ -24,23 +24,25 @@ def described(out: str) -> dict[str, str]:
         pytest.param("virtual_gallery", 12, "centre", marks=pytest.mark.slow),
     ],
 )
-def test_info_says_what_the_foreign_map_allows(
+def test_the_content_and_possible_uses_of_a_foreign_map_are_listed(
     megloc: Any, request: pytest.FixtureRequest, given: str, images: int, origin: str
 ) -> None:
     place = request.getfixturevalue(given) / "map"
     done = megloc("info", place)
     assert (done.status, done.err) == (0, "")
-    told = described(done.out)
-    assert told["images"] == f"{images} ({images} PINHOLE), {images} with a pose"
-    assert told["points"] == str(len(KaptureFolder(place).points3d()))
-    assert told["pixel origin"].startswith(f"{origin}: ")
-    assert told["map descriptors"] == "there"
-    # R2D2 has an extractor, whose weights are not there
-    assert told["query features"].startswith("must be given in kapture; plugin r2d2 could extract")
-    assert "megloc weights fetch r2d2_WASF_N16" in told["query features"]
-    # so few that all are matched; vectors without the weights that make a query's
+    listed = described(done.out)
+    assert listed["images"] == f"{images} ({images} PINHOLE), {images} with a pose"
+    assert listed["points"] == str(len(KaptureFolder(place).points3d()))
+    assert listed["pixel origin"].startswith(f"{origin}: ")
+    assert listed["map descriptors"] == "there"
+    # R2D2 has an extractor, but its weights are missing
+    assert listed["query features"].startswith(
+        "must be given in kapture; plugin r2d2 could extract"
+    )
+    assert "megloc weights fetch r2d2_WASF_N16" in listed["query features"]
+    # the few images are all matched; global features of queries need missing weights
     every = f"all {images} map images"
-    assert told["retrieval"] == f"{every}, not ranked"
+    assert listed["retrieval"] == f"{every}, not ranked"
     ranked = f"where queries bring AP-GeM-LM18: {every}, ranked by global features AP-GeM-LM18"
     assert ranked in done.out
     errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
@@ -49,18 +51,20 @@ def test_info_says_what_the_foreign_map_allows(
     assert of_origin < 0.9 * of_other and float(errors[1 + (origin == "centre")]) == of_origin
 
 
-def test_info_of_our_own_map_and_of_what_is_none(megloc: Any, finished: Path, scene: Path) -> None:
-    told = described(megloc("info", finished / "map", "--deep").out)
-    assert told["checked"] == "everything, image by image"
-    assert told["pixel origin"].startswith("corner: ")
-    assert told["query features"].startswith("extracted by plugin rootsift")
-    assert told["map descriptors"] == "there"
-    told = described(megloc("info", scene / "query").out)
-    assert told["images"] == "4 (4 PINHOLE), 0 with a pose"
-    assert told["localizing"] == "not possible: no points3d and observations"
+def test_our_own_map_is_checked_completely_on_demand(megloc: Any, finished: Path) -> None:
+    listed = described(megloc("info", finished / "map", "--deep").out)
+    assert listed["checked"] == "everything, image by image"
+    assert listed["pixel origin"].startswith("corner: ")
+    assert listed["query features"].startswith("extracted by plugin rootsift")
+    assert listed["map descriptors"] == "there"
 
 
-def test_cameras_that_are_not_calibrated(megloc: Any, scene: Path, tmp_path: Path) -> None:
+def test_a_folder_of_queries_is_no_map_and_may_have_unknown_cameras(
+    megloc: Any, scene: Path, tmp_path: Path
+) -> None:
+    listed = described(megloc("info", scene / "query").out)
+    assert listed["images"] == "4 (4 PINHOLE), 0 with a pose"
+    assert listed["localizing"] == "not possible: no points3d and observations"
     data = KaptureFolder(scene / "query").read()
     for name, sensor in data.sensors.items():
         data.sensors[name] = replace(sensor, params=("UNKNOWN_CAMERA", *sensor.params[1:3]))

@@ -1,9 +1,11 @@
-"""The command as such: help, examples, options, errors of the command line, tracebacks, pipes."""
+"""The command itself: help, options, wrong arguments, signals, pipes, shell completion."""
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -17,7 +19,7 @@ from megloc_kapture.cli.main import COMMANDS, main
 from megloc_kapture.pipeline.presets import BASIC_OPTIONS, PRESETS, options_of, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 
-BAD_ARGUMENTS = {
+WRONG_ARGUMENTS = {
     "no command": ([], "Missing subcommand"),
     "unknown command": (["localise"], "unknown command 'localise'; did you mean 'localize'"),
     "missing flags": (["refine-poses", "-i", "map", "--poses", "p", "-o", "out"], "--query PATH"),
@@ -30,7 +32,7 @@ BAD_ARGUMENTS = {
 }
 
 
-@pytest.mark.parametrize(("arguments", "message"), BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
+@pytest.mark.parametrize(("arguments", "message"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS)
 def test_wrong_arguments_are_refused(megloc: Any, arguments: list[str], message: str) -> None:
     done = megloc(*arguments)
     assert (done.status, done.out) == (2, "")
@@ -38,18 +40,14 @@ def test_wrong_arguments_are_refused(megloc: Any, arguments: list[str], message:
     assert "Traceback" not in done.err and "pydantic" not in done.err
 
 
-@pytest.mark.parametrize("flag", ["-h", "--help"])
-@pytest.mark.parametrize("command", [None, *COMMANDS])
-def test_help(megloc: Any, command: str | None, flag: str) -> None:
-    done = megloc(*([command] if command else []), flag)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_help_text(megloc: Any, command: str) -> None:
+    done = megloc(command, "-h")
     assert (done.status, done.err) == (0, "")
-    if command is None:
-        assert all(name in done.out for name in COMMANDS)
-    else:
-        assert done.out.startswith(f"usage: megloc {command} ")
+    assert done.out.startswith(f"usage: megloc {command} ")
 
 
-def test_the_list_of_commands_costs_no_solver() -> None:
+def test_the_list_of_commands_loads_no_heavy_package() -> None:
     code = (
         "import sys\nfrom megloc_kapture.cli.main import main\n"
         "try: main(['--help'])\n"
@@ -57,63 +55,76 @@ def test_the_list_of_commands_costs_no_solver() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("\n[]\n")
+    assert all(name in done.stdout for name in COMMANDS)
 
 
-def completed(script: str, *words: str) -> list[str]:
-    """What bash offers for a line that ends with the last of the words."""
-    line = (
-        f"COMP_WORDS=({shlex.join(words)}); COMP_CWORD={len(words) - 1}; COMP_LINE='{words}'; "
-        '_tyro_megloc; printf "%s\\n" "${COMPREPLY[@]}"'
-    )
-    done = subprocess.run(
-        ["bash", "-c", f"{script}\n{line}"], capture_output=True, text=True, check=True
-    )
-    return done.stdout.split()
+def test_sigterm_ends_with_143_and_says_how_to_continue(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def terminate(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(sys, "argv", ["megloc", "options"])
+    monkeypatch.setattr("megloc_kapture.cli.info.OptionsCommand.run", terminate)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(SystemExit) as end:
+            main()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert end.value.code == 143
+    message = "megloc: terminated; run the same command again to go on\n"
+    assert capsys.readouterr().err == message
 
 
-def script_for(shell: str, capsys: pytest.CaptureFixture[str]) -> str:
+def test_bash_completes_commands_and_their_flags(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["--tyro-print-completion", shell])
-    return capsys.readouterr().out
+        main(["--tyro-print-completion", "bash"])
+    script = capsys.readouterr().out
 
+    def completed(*words: str) -> list[str]:
+        """Return the candidates of bash for a line that ends with the last of the words."""
+        line = (
+            f"COMP_WORDS=({shlex.join(words)}); COMP_CWORD={len(words) - 1}; COMP_LINE='{words}'; "
+            '_tyro_megloc; printf "%s\\n" "${COMPREPLY[@]}"'
+        )
+        command = ["bash", "-c", f"{script}\n{line}"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
 
-def test_completion_knows_commands_and_their_flags(capsys: pytest.CaptureFixture[str]) -> None:
-    script = script_for("bash", capsys)
-    assert set(COMMANDS) <= set(completed(script, "megloc", ""))
-    assert completed(script, "megloc", "loc") == ["localize"]
-    assert "--features-dir" in completed(script, "megloc", "match", "--feat")
-    assert script_for("zsh", capsys).startswith("#compdef megloc")
+    assert set(COMMANDS) <= set(completed("megloc", ""))
+    assert completed("megloc", "loc") == ["localize"]
+    assert "--features-dir" in completed("megloc", "match", "--feat")
 
 
 def test_every_option_is_listed_with_a_meaning(megloc: Any) -> None:
     basic = megloc("options", "--basic").out
     assert len(re.findall(r"^[a-z_.]+ = ", basic, flags=re.M)) == len(BASIC_OPTIONS) == 10
-    told = megloc("options").out
+    listed = megloc("options").out
     every = list(options_of(PipelineOptions()))
     assert 50 < len(every) <= 60
     for option in every:
-        assert f"\n{option.key} = {shown(option.value)}\n" in f"\n{told}"
-        assert option.meaning and option.meaning in told, option.key
+        assert f"\n{option.key} = {shown(option.value)}\n" in f"\n{listed}"
+        assert option.meaning and option.meaning in listed, option.key
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_value_is_shown_as_set_takes_it(preset: str) -> None:
+def test_a_shown_value_is_accepted_by_set(preset: str) -> None:
     for option in options_of(PRESETS[preset]):
         text = f"{option.key}={shown(option.value)}"
         if isinstance(option.value, tuple) or option.key == "stages" or "none" in text:
             continue
         changed = options_of_preset(preset, assignments=[text])
-        found = {one.key: one.value for one in options_of(changed)}[option.key]
-        if isinstance(found, float):
-            assert found == pytest.approx(option.value, rel=1e-3)
+        actual = {option.key: option.value for option in options_of(changed)}[option.key]
+        if isinstance(actual, float):
+            assert actual == pytest.approx(option.value, rel=1e-3)
         else:
-            assert found == option.value, text
+            assert actual == option.value, text
 
 
-def test_a_step_one_option_and_a_plugin(megloc: Any) -> None:
-    told = megloc("options", "query_pairs", "--preset", "megloc").out
-    assert told.startswith("query_pairs.by = retrieval\n    'retrieval' | 'exhaustive'; ")
-    assert "query_pairs.top_k = 50\n" in told and "mapping_pairs" not in told
+def test_options_are_listed_by_stage_key_and_plugin(megloc: Any) -> None:
+    of_stage = megloc("options", "query_pairs", "--preset", "megloc").out
+    assert of_stage.startswith("query_pairs.by = retrieval\n    'retrieval' | 'exhaustive'; ")
+    assert "query_pairs.top_k = 50\n" in of_stage and "mapping_pairs" not in of_stage
     assert megloc("options", "query_pairs.top_k").out.count("\n") == 2
     assert "aliked: options.threshold = 0.2\n" in megloc("options", "aliked").out
     assert "vlad: options." in megloc("options", "vlad").out
@@ -122,3 +133,15 @@ def test_a_step_one_option_and_a_plugin(megloc: Any) -> None:
 def test_the_version(megloc: Any) -> None:
     assert megloc("--version").out == f"megloc-kapture {version('megloc-kapture')}\n"
     assert megloc_kapture.__version__ == version("megloc-kapture")
+
+
+def test_no_command_imports_the_web_server_but_serve() -> None:
+    code = """
+import sys
+from megloc_kapture.cli.main import COMMANDS, command_class
+for name in COMMANDS:
+    command_class(name)
+print({"fastapi", "uvicorn", "starlette"} & set(sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("set()\n", "")

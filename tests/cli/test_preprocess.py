@@ -1,4 +1,4 @@
-"""``megloc preprocess``: flags, what it says, and what it leaves behind."""
+"""``megloc preprocess``: flags, printed counts and written files."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def images_of(scene: Path) -> list[str]:
 
 
 def flags(*arguments: str) -> Preprocess:
-    """The command as these arguments make it."""
+    """Return the command with these arguments."""
     import tyro
 
     given = ["-i", "in", "-o", "out", *arguments]
     return tyro.cli(Preprocess, args=given, config=(tyro.conf.OmitArgPrefixes,))
 
 
-def test_flags_make_the_options() -> None:
+def test_flags_are_converted_to_options() -> None:
     options = flags(
         *("--resize", "1600", "--undistort", "--set", "upscale=true", "--unchanging"),
         *("--bottom-share", "rear=0.2", "--bottom-share", "left/a=b*.jpg=0.1"),
@@ -72,7 +72,7 @@ def test_images_are_resized_and_masked(
     mask = read_image_rgb(out / "sensors" / "masks" / f"{image}.png")[..., 0]
     assert set(np.unique(mask)) == {0, 255} and (mask[-30:] == 0).all()
 
-    # again without the mask: nothing of the first run is left
+    # a second run without the mask leaves no mask of the first
     assert megloc(*small).status == 0
     assert not (out / "sensors" / "masks").exists()
     assert [p.name for p in sorted(out.iterdir())] == [".megloc", "sensors"]

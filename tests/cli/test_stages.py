@@ -1,4 +1,4 @@
-"""The stages one by one make what ``megloc eval`` makes; and import, evaluate and submit."""
+"""The stages as single commands, followed by localize, evaluate and submit."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import torch
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.kapture import read_pairs
 from megloc_kapture.io.tables import read_match_counts
 
 Contents = Callable[[Path], dict[str, bytes]]
@@ -26,7 +24,7 @@ INLINE = ("--executor", "inline")
 
 @dataclass(frozen=True)
 class Made:
-    """What the chain of single stages wrote."""
+    """Outputs of the single stages."""
 
     features: Path
     vlad: Path
@@ -39,8 +37,7 @@ class Made:
 
 @pytest.fixture(scope="module")
 def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Every stage up to the map and the matches of the queries, each by its own command; not to
-    be written into."""
+    """Outputs of every stage up to the map and the matches of queries; read only."""
     root = tmp_path_factory.mktemp("made")
     made = Made(*(root / field.name for field in fields(Made)))
     mapping, query = scene / "mapping", scene / "query"
@@ -57,13 +54,13 @@ def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
         [*match, made.query_pairs, "--query", query, "-o", made.query_matches],
         [*triangulate, "--pairs", made.mapping_pairs, "-o", made.map],
     ):
-        with pytest.raises(SystemExit) as end, redirect_stderr(io.StringIO()) as told:
+        with pytest.raises(SystemExit) as end, redirect_stderr(io.StringIO()) as err:
             main([*map(str, command), "--quiet"])
-        assert (end.value.code, told.getvalue()) == (0, ""), command[0]
+        assert (end.value.code, err.getvalue()) == (0, ""), command[0]
     return made
 
 
-def test_stages_one_by_one_make_the_same_bytes(
+def test_single_stages_write_the_same_files_as_eval(
     made: Made, finished: Path, contents: Contents
 ) -> None:
     def without_marks(folder: Path) -> dict[str, bytes]:
@@ -80,14 +77,14 @@ def test_stages_one_by_one_make_the_same_bytes(
     assert made.query_pairs.read_bytes() == expected["pairs/query.txt"]
     for place, name in ((made.mapping_matches, "mapping"), (made.query_matches, "query")):
         prefix = f"matches/{name}/"
-        found = without_marks(place)
-        assert found and found == {n.removeprefix(prefix): c for n, c in part(prefix).items()}
+        actual = without_marks(place)
+        assert actual and actual == {n.removeprefix(prefix): c for n, c in part(prefix).items()}
     for name in ("points3d.txt", "observations.txt"):
         ours = (made.map / "reconstruction" / name).read_bytes()
         assert ours == expected[f"map/reconstruction/{name}"]
 
 
-def test_and_the_map_they_make_is_one_to_localize_in(
+def test_the_map_of_single_stages_is_localized_in_evaluated_and_submitted(
     megloc: Any, made: Made, scene: Path, tmp_path: Path
 ) -> None:
     result = tmp_path / "localized"
@@ -105,106 +102,78 @@ def test_and_the_map_they_make_is_one_to_localize_in(
     done = megloc("submit", "kapture", "-i", result, "-o", poses)
     assert done.out == f"4 poses of 4 queries: {poses}\n"
     assert poses.with_name("poses.txt.json").is_file()
-    # the pose file is as good as the folder it comes from
+    # the pose file gives the same recall as the folder
     again = megloc("evaluate", "-i", poses, "--gt", scene / "query_gt")
     assert "100.0 / 100.0 / 100.0 / 100.0" in again.out
     megloc("submit", "kapture", "-i", result, "-o", poses).refused(r"poses\.txt exists; -f")
     assert megloc("submit", "kapture", "-i", result, "-o", poses, "-f").status == 0
 
 
-def test_reranking_keeps_the_best_matched_and_their_matches(
+def test_reranked_pairs_and_their_matches_are_written(
     megloc: Any, made: Made, scene: Path, tmp_path: Path
 ) -> None:
     pairs, matches = tmp_path / "reranked.txt", tmp_path / "reranking"
-    both = ["--features-dir", made.features, "--features-dir", made.vlad]
-    command = ["pairs-query", "-i", scene / "mapping", "--query", scene / "query", "-o", pairs]
-    by = ("--rerank", "2", "--rerank-by", "verified")
-    done = megloc(*command, *both, *by, "--matches-dir", matches, *INLINE, "-q")
-    assert (done.status, done.err) == (0, "")
-    counted = read_match_counts(matches, "rootsift")
-    counts = {(count.image, count.other): count.verified for count in counted}
-    # all candidates were matched, and the matches are those that a later step makes
+    folders = ("--features-dir", made.features, "--features-dir", made.vlad)
+    queries = ("-i", scene / "mapping", "--query", scene / "query", "-o", pairs)
+    command = ("pairs-query", *queries, *folders, "--rerank", "2", "--rerank-by", "verified")
+    assert megloc(*command, "--matches-dir", matches, *INLINE, "-q").status == 0
+    counts = {(c.image, c.other): c.verified for c in read_match_counts(matches, "rootsift")}
     assert counts.keys() == {(pair.query, pair.map) for pair in read_pairs(made.query_pairs)}
-    kept = read_pairs(pairs)
-    for query in {pair.query for pair in kept}:
+    for query in {query for query, _ in counts}:
         best = sorted((n for (q, _), n in counts.items() if q == query), reverse=True)[:2]
-        assert [counts[pair.query, pair.map] for pair in kept if pair.query == query] == best
-    found, again = (
-        KaptureFolder(scene / "query", features_dirs=[folder]).matches("rootsift")
-        for folder in (matches, made.query_matches)
-    )
-    for pair in ((pair.query, pair.map) for pair in kept):
-        np.testing.assert_array_equal(found.read(*pair)[0], again.read(*pair)[0])
-    refused = megloc(*command, *both, "--rerank", "2", "-f")
-    refused.refused("--rerank N and --matches-dir DIR go together")
-    megloc(*command, *both).refused(r"reranked\.txt exists; -f")
+        kept = [counts[pair.query, pair.map] for pair in read_pairs(pairs) if pair.query == query]
+        assert kept == best
+    megloc(*command, "-f").refused("--rerank N and --matches-dir DIR go together")
+    megloc(*command, "--matches-dir", matches).refused(r"reranked\.txt exists; -f")
 
 
-def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    mapping, points, pairs = finished / "mapping", finished / "map", tmp_path / "pairs.txt"
-    command = ("pairs-mapping", "-i", mapping, "-o", pairs, "--by")
-
-    def count(*arguments: str | Path) -> int:
-        done = megloc(*command, *arguments, "-f", "-q")
-        assert done.status == 0, done.err
-        return len(read_pairs(pairs))
-
-    assert count("exhaustive") == 21
-    one = ("--topk", "1", "--features-dir", finished)
-    nearest = count("retrieval", *one)
-    assert 4 <= nearest <= 7
-    assert nearest <= count("retrieval", "poses", *one) <= 21
-    # the images stand in the order in which they were taken
+def test_methods_of_pairing_are_combined(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    pairs = tmp_path / "pairs.txt"
+    command = ("pairs-mapping", "-i", finished / "mapping", "-o", pairs, "-f", "--by")
     window = ("--set", "mapping_pairs.sequence.window=1")
-    assert count("sequence", *window) == 6
-    assert count("sequence", *window, "--set", "mapping_pairs.sequence.loop=true") == 7
-    shared = count("covisibility", "--covisibility-map", points)
-    assert 0 < shared <= 21
-    both = count("covisibility", "sequence", "--covisibility-map", points)
-    assert max(shared, 6) <= both <= 21
-    own = megloc("pairs-mapping", "-i", points, "-o", pairs, "--by", "covisibility", "-f")
-    assert own.err == f"{shared} pairs\n"
-    for arguments, words in (
-        (("covisibility", "-f"), "mapping: no map to pair images by co-visibility"),
-        (("sequence", "--covisibility-map", points, "-f"), "--covisibility-map is for --by covis"),
-        (("exhaustive",), r"pairs\.txt exists; -f overwrites it"),
-        (("retrieval", "-f"), "mapping: no global_features; give their folder with --features-dir"),
-    ):
-        megloc(*command, *arguments).refused(words)
-    query = ["pairs-query", "-i", mapping, "--query", finished / "query", "--exhaustive", "-q"]
-    assert megloc(*query, "-o", tmp_path / "query.txt").status == 0
-    assert len(read_pairs(tmp_path / "query.txt")) == 28
+    assert megloc(*command, "sequence", *window).err == "6 pairs\n"
+    shared = ("covisibility", "sequence", "--covisibility-map", finished / "map")
+    assert megloc(*command, *shared, *window).status == 0
+    assert 6 <= len(read_pairs(pairs)) <= 21
+    nearest = ("retrieval", "poses", "--topk", "1", "--features-dir", finished)
+    assert megloc(*command, *nearest).status == 0
+    assert 4 <= len(read_pairs(pairs)) <= 21
 
 
-def test_what_cannot_be_matched_is_refused(megloc: Any, workspace: Path, tmp_path: Path) -> None:
-    pairs, output = tmp_path / "pairs.txt", ("-o", tmp_path / "new", *INLINE)
+@pytest.mark.parametrize(
+    ("by", "message"),
+    [
+        (("covisibility",), "mapping: no map to pair images by co-visibility"),
+        (("sequence", "--covisibility-map", "{}/map"), "--covisibility-map is for --by covis"),
+        (("retrieval",), "mapping: no global_features; give their folder with --features-dir"),
+    ],
+)
+def test_pairs_without_their_inputs_are_refused(
+    megloc: Any, finished: Path, tmp_path: Path, by: tuple[str, ...], message: str
+) -> None:
+    given = [word.format(finished) for word in by]
+    command = ("pairs-mapping", "-i", finished / "mapping", "-o", tmp_path / "pairs.txt", "--by")
+    megloc(*command, *given).refused(message)
+
+
+def test_pairs_of_unknown_images_are_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    pairs = tmp_path / "pairs.txt"
     pairs.write_text("0000.jpg, 0002.jpg, 1.0\n0000.jpg, 0001.jpg, 1.0\n")
-    command = ["match", "-i", workspace / "mapping", "--features-dir", workspace, *output]
+    places = ("-i", finished / "mapping", "--features-dir", finished, "-o", tmp_path / "new")
     message = r"pairs\.txt: no image 0001\.jpg in .*/mapping"
-    megloc(*command, "--pairs", pairs).refused(message)
-    spoilt = workspace / "local_features/rootsift/descriptors/0002.jpg.desc"
-    content = spoilt.read_bytes()
-    spoilt.unlink()  # a map may have it by another name
-    spoilt.write_bytes(content[:-512])
-    done = megloc(*command, "--pairs", workspace / "pairs/mapping.txt")
-    done.refused(f"{spoilt}: 799 descriptors for 800 keypoints")
+    megloc("match", *places, "--pairs", pairs, *INLINE).refused(message)
     assert not (tmp_path / "new").exists()
 
 
-def test_networks_compute_where_the_flags_say(
+def test_device_and_precision_of_networks_are_chosen_by_flags(
     megloc: Any, shared_data: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(shared_data / "weights"))
-    mapping, features = scene / "mapping", tmp_path / "features"
-    extract = ["extract-local", "-i", mapping, *INLINE]
-    half = [*extract, "--features", "xfeat", "-o", features, "--precision", "half"]
-    assert megloc(*half, "--device", "cpu").status == 0
-    full = [*extract, "--features", "xfeat", "-o", tmp_path / "full"]
-    assert megloc(*full).status == 0
-    name = f"local_features/xfeat/keypoints/{KaptureFolder(mapping).read().image_names()[0]}.kpt"
-    both = [(place / name).read_bytes() for place in (features, tmp_path / "full")]
-    assert both[0] != both[1]
+    command = ("extract-local", "-i", scene / "query", *INLINE, "--features", "xfeat", "-o")
+    assert megloc(*command, tmp_path / "full", "--device", "cpu").status == 0
+    assert megloc(*command, tmp_path / "half", "--precision", "half").status == 0
+    name = "local_features/xfeat/keypoints/0001.jpg.kpt"
+    full, half = ((tmp_path / place / name).read_bytes() for place in ("full", "half"))
+    assert full != half
     run = ["eval", "kapture", "--root", scene, "-w", tmp_path / "run", "-q", "--dry-run"]
     megloc(*run, "--preset", "modern", "--device", "gpu").refused("option device: String should")
-    if not torch.cuda.is_available():
-        megloc(*full, "-f", "--device", "cuda:1").refused("device=cuda:1: this machine has no GPU")

@@ -1,8 +1,7 @@
-"""COLMAP models as kapture maps, read by kapture's own reader and compared with pycolmap."""
+"""COLMAP models as kapture maps, read by kapture and compared with pycolmap."""
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
 from dataclasses import replace
@@ -12,7 +11,6 @@ from typing import Any
 import kapture.io.csv
 import numpy as np
 import pytest
-from kapture.converter.colmap.database import COLMAPDatabase
 from PIL import Image
 
 from megloc_kapture.datasets.colmap_map import (
@@ -25,16 +23,14 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.pipeline.results import Results
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 
 @pytest.fixture
-def own(colmap_room: Path, tmp_path: Path) -> Path:
-    """A copy of the colmap_room, to be spoilt."""
-    return Path(shutil.copytree(colmap_room, tmp_path / "own", symlinks=True))
+def room(colmap_room: Path, tmp_path: Path) -> Path:
+    """A copy of the colmap_room that a test may change."""
+    return Path(shutil.copytree(colmap_room, tmp_path / "room", symlinks=True))
 
 
 def import_colmap(source: ColmapFolders, output: Path) -> dict[str, float] | None:
@@ -50,8 +46,8 @@ def imported(source: ColmapFolders, output: Path) -> tuple[KaptureFolder, dict[s
     return folder, counts
 
 
-def execute(own: Path, statement: str, *values: Any) -> None:
-    with sqlite3.connect(own / "database.db") as connection:
+def execute(room: Path, statement: str, *values: Any) -> None:
+    with sqlite3.connect(room / "database.db") as connection:
         connection.execute(statement, values)
     connection.close()
 
@@ -75,7 +71,7 @@ CAMERAS = {
 
 
 def synthetic(root: Path, form: str) -> Any:
-    """COLMAP's own synthetic scene with rigs of three cameras, each camera of another model."""
+    """Write COLMAP's synthetic scene with rigs of three cameras of different models."""
     pycolmap.set_random_seed(3)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 5, 3, 2
@@ -94,7 +90,7 @@ def synthetic(root: Path, form: str) -> Any:
 
 
 @pytest.mark.parametrize("form", ["text", "binary"])
-def test_poses_rigs_and_projections_are_colmap_s(tmp_path: Path, form: str) -> None:
+def test_poses_rigs_and_projections_equal_those_of_colmap(tmp_path: Path, form: str) -> None:
     truth = synthetic(tmp_path / "ws", form)
     folder, counts = imported(find_colmap(tmp_path / "ws"), tmp_path / "map")
     assert counts["images"] == 30 and counts["points"] == len(truth.points3D)
@@ -108,7 +104,7 @@ def test_poses_rigs_and_projections_are_colmap_s(tmp_path: Path, form: str) -> N
     for image in truth.images.values():
         moment, sensor = data.record_of(image.name)
         assert moment == image.frame_id
-        # kapture's own reading: the pose of the camera, and the same through the rig
+        # as read by kapture: the pose of the camera, and the same through the rig
         pose, expected = theirs.trajectories[moment, sensor], image.cam_from_world()
         np.testing.assert_allclose(pose.r_raw, np.roll(expected.rotation.quat, 1), atol=1e-9)
         np.testing.assert_allclose(pose.t_raw, expected.translation, rtol=0, atol=1e-9)
@@ -129,65 +125,57 @@ def test_poses_rigs_and_projections_are_colmap_s(tmp_path: Path, form: str) -> N
         assert ids == {(order[point_id], k) for point_id, k in tracks}
 
 
-@pytest.mark.parametrize("with_database", [True, False])
-def test_queries_are_localized(
-    colmap_room: Path, scene: Path, tmp_path: Path, with_database: bool
+def test_a_map_with_the_features_of_the_database_has_the_observations_of_the_model(
+    colmap_room: Path, tmp_path: Path
 ) -> None:
-    """With the database's features, or with SIFT extracted again, once."""
-    found = find_colmap(colmap_room)
-    assert found.database == colmap_room / "database.db"
-    source = found if with_database else replace(found, database=None)
+    source = find_colmap(colmap_room)
+    assert source.database == colmap_room / "database.db"
     folder, counts = imported(source, tmp_path / "map")
-    read = pycolmap.Reconstruction(colmap_room / "sparse" / "0")
-    assert counts["points"] == len(read.points3D)
-    if with_database:
-        assert counts["observations"] == read.compute_num_observations()
-        with sqlite3.connect(colmap_room / "database.db") as database:
-            rows = database.execute("SELECT SUM(rows) FROM keypoints").fetchone()[0]
-        assert counts["keypoints"] == rows
-    else:
-        assert counts["share_found_again"] > 0.99
+    model = pycolmap.Reconstruction(colmap_room / "sparse" / "0")
+    assert counts["points"] == len(model.points3D)
+    assert counts["observations"] == model.compute_num_observations()
+    with sqlite3.connect(colmap_room / "database.db") as database:
+        rows = database.execute("SELECT SUM(rows) FROM keypoints").fetchone()[0]
+    assert counts["keypoints"] == rows
     assert folder.descriptors("sift").names == folder.read().image_names()
     assert sorted(p.name for p in (tmp_path / "map").iterdir()) == ["reconstruction", "sensors"]
     link = tmp_path / "map" / "sensors" / "records_data"
-    assert os.readlink(link) == str((colmap_room / "images").resolve())
+    assert link.readlink() == (colmap_room / "images").resolve()
     opened = KaptureMap.open(tmp_path / "map")
     assert opened.fault() is None and opened.pixel_origin.intrinsics == "corner"
-    truth = KaptureFolder(scene / "query_gt").read().poses()
-    for name, pose in Results(Localizer(opened), scene / "query").items():
-        assert pose, (name, pose)
-        off = pose.cam_from_world @ truth[name].inverse()
-        assert np.linalg.norm(pose.cam_from_world.center() - truth[name].center()) < 0.01
-        assert 2 * np.degrees(np.arccos(min(1.0, abs(off.quat_wxyz[0])))) < 0.05
 
 
-def write_type(own: Path, kind: int, size: int) -> None:
-    """Give all descriptors another type and size."""
-    with sqlite3.connect(own / "database.db") as connection:
+def test_without_a_database_features_are_extracted_again(colmap_room: Path, tmp_path: Path) -> None:
+    source = replace(find_colmap(colmap_room), database=None)
+    folder, counts = imported(source, tmp_path / "map")
+    assert counts["share_found_again"] > 0.99
+    assert folder.descriptors("sift").names == folder.read().image_names()
+
+
+def write_type(room: Path, kind: int, size: int) -> None:
+    """Change the type and size of all descriptors."""
+    with sqlite3.connect(room / "database.db") as connection:
         images = connection.execute("SELECT image_id, rows FROM keypoints").fetchall()
     connection.close()
     for image_id, rows in images:
         content = np.full((rows, size // 4), 0.25, "<f4").tobytes()
         change = "UPDATE descriptors SET type = ?, cols = ?, data = ? WHERE image_id = ?"
-        execute(own, change, kind, size, content, image_id)
+        execute(room, change, kind, size, content, image_id)
 
 
 @pytest.mark.parametrize(
     ("kind", "local_type", "dtype", "size", "extractor"),
     [
         (pycolmap.FeatureExtractorType.ALIKED_N16ROT, "aliked-n16rot", np.float32, 128, "aliked"),
-        (pycolmap.FeatureExtractorType.ALIKED_N32, "aliked-n32", np.float32, 128, "aliked"),
         (3, "loma-b", np.float32, 128, None),
-        (4, "loma-b128", np.float32, 128, None),
-        (-1, "colmap-undefined", np.uint8, 512, None),
         (99, "colmap-99", np.uint8, 512, None),
     ],
 )
-def test_types_of_features(
-    own: Path, tmp_path: Path, kind: Any, local_type: str, dtype: Any, size: int, extractor: Any
+def test_types_of_features_are_named_after_their_extractor(
+    room: Path, tmp_path: Path, kind: Any, local_type: str, dtype: Any, size: int, extractor: Any
 ) -> None:
-    write_type(own, int(kind), 512)
-    folder, _ = imported(find_colmap(own), tmp_path / "map")
+    write_type(room, int(kind), 512)
+    folder, _ = imported(find_colmap(room), tmp_path / "map")
     config = folder.descriptors(local_type).config
     assert (config.dtype, config.dsize, config.keypoints_type) == (dtype, size, local_type)
     plugin = KaptureMap.open(tmp_path / "map").keypoints[local_type].extractor()
@@ -196,162 +184,127 @@ def test_types_of_features(
         assert plugin.options == {"weights": local_type}
 
 
-def test_the_database_of_an_older_version(colmap_room: Path, own: Path, tmp_path: Path) -> None:
-    """Its schema has no types; a model before version 4 has no rigs."""
-    for name in ("rigs.bin", "frames.bin"):
-        (own / "sparse" / "0" / name).unlink()
-    (own / "database.db").unlink()
-    database = COLMAPDatabase.connect(str(own / "database.db"))
-    database.create_tables()
-    with sqlite3.connect(colmap_room / "database.db") as newer:
-        for row in newer.execute("SELECT camera_id, model, width, height, params FROM cameras"):
-            database.add_camera(*row[1:4], np.frombuffer(row[4]), camera_id=row[0])
-        for image_id, name, camera_id in newer.execute("SELECT * FROM images").fetchall():
-            database.add_image(name, camera_id, image_id=image_id)
-            for table, dtype in (("keypoints", np.float32), ("descriptors", np.uint8)):
-                query = f"SELECT rows, cols, data FROM {table} WHERE image_id = {image_id}"
-                rows, columns, content = newer.execute(query).fetchone()
-                values = np.frombuffer(content, dtype).reshape(rows, columns)
-                getattr(database, f"add_{table}")(image_id, values)
-    newer.close()
-    database.commit()
-    database.close()
-    new, _ = imported(find_colmap(colmap_room), tmp_path / "new")
-    # that the images are not here changes nothing of it
-    old, _ = imported(replace(find_colmap(own), images=None), tmp_path / "old")
-    assert not KaptureMap.open(old.root).has_images()
-    assert old.read().poses() == new.read().poses()
-    for image in new.read().image_names():
-        for kind in ("keypoints", "descriptors"):
-            a, b = (getattr(folder, kind)("sift").read(image) for folder in (new, old))
-            assert np.array_equal(a, b)
-
-
-def rename(own: Path, names: dict[str, str]) -> None:
+def rename(room: Path, names: dict[str, str]) -> None:
     """Give images of a workspace other names, in all of its parts."""
-    model = pycolmap.Reconstruction(own / "sparse" / "0")
+    model = pycolmap.Reconstruction(room / "sparse" / "0")
     for image in model.images.values():
         if image.name in names:
             new = names[image.name]
-            (own / "images" / new).parent.mkdir(exist_ok=True)
-            (own / "images" / image.name).rename(own / "images" / new)
-            execute(own, "UPDATE images SET name = ? WHERE name = ?", new, image.name)
+            (room / "images" / new).parent.mkdir(exist_ok=True)
+            (room / "images" / image.name).rename(room / "images" / new)
+            execute(room, "UPDATE images SET name = ? WHERE name = ?", new, image.name)
             image.name = new
-    model.write_binary(own / "sparse" / "0")
+    model.write_binary(room / "sparse" / "0")
 
 
-@pytest.mark.parametrize("with_database", [True, False])
-def test_names_that_kapture_cannot_hold(own: Path, tmp_path: Path, with_database: bool) -> None:
+def test_names_that_kapture_cannot_hold_are_changed(room: Path, tmp_path: Path) -> None:
     names = {"0000.jpg": "my photos/a, b.jpg", "0002.jpg": "#c d.jpg", "0003.jpg": " e.jpg"}
-    rename(own, names)
-    found = find_colmap(own)
-    source = found if with_database else replace(found, database=None)
-    folder, _ = imported(source, tmp_path / "map")
+    rename(room, names)
+    folder, _ = imported(find_colmap(room), tmp_path / "map")
     written = {"my photos/a_ b.jpg": names["0000.jpg"], "_c d.jpg": "#c d.jpg", "_e.jpg": " e.jpg"}
     theirs = kapture.io.csv.kapture_from_dir(str(tmp_path / "map"))
     listed = {name for _, _, name in kapture.flatten(theirs.records_camera)}
     assert listed == set(folder.read().image_names()) and set(written) <= listed
     assert theirs.descriptors is not None and theirs.descriptors["sift"] == listed
     for new, old in written.items():
-        assert folder.image_path(new).samefile(own / "images" / old)
-
-
-def test_two_images_of_one_name_are_refused(own: Path, tmp_path: Path) -> None:
-    rename(own, {"0000.jpg": "a,b.jpg", "0002.jpg": "a_b.jpg"})
+        assert folder.image_path(new).samefile(room / "images" / old)
+    rename(room, {names["0000.jpg"]: "a,b.jpg", "0005.jpg": "a_b.jpg"})
     with pytest.raises(DataError, match=r"'a,b.jpg' and 'a_b.jpg' would both be 'a_b.jpg'"):
-        import_colmap(find_colmap(own), tmp_path / "map")
+        import_colmap(find_colmap(room), tmp_path / "other")
 
 
-def test_the_parts_are_found(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = own / "sparse" / "0"
-    found = ColmapFolders(model, own / "images", own / "database.db")
-    for path in (own, own / "sparse", model):
-        assert is_colmap(path) and find_colmap(path) == found
-    assert not is_colmap(own / "images") and not is_colmap(own / "none")
-    # given ones come first
-    (own / "other").mkdir()
-    assert find_colmap(own, images=own / "other") == replace(found, images=own / "other")
-    # as image_undistorter has it
-    (own / "dense").mkdir()
-    (own / "dense" / "sparse").symlink_to(model)
-    assert find_colmap(own / "dense") == ColmapFolders(own / "dense" / "sparse", None, None)
-    shutil.copytree(model, own / "sparse" / "1")
+def test_images_and_database_are_searched_near_the_model(
+    room: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = room / "sparse" / "0"
+    expected = ColmapFolders(model, room / "images", room / "database.db")
+    for path in (room, room / "sparse", model):
+        assert is_colmap(path) and find_colmap(path) == expected
+    assert not is_colmap(room / "images") and not is_colmap(room / "none")
+    # given folders take precedence
+    (room / "other").mkdir()
+    assert find_colmap(room, images=room / "other") == replace(expected, images=room / "other")
+    # the layout of image_undistorter
+    (room / "dense").mkdir()
+    (room / "dense" / "sparse").symlink_to(model)
+    assert find_colmap(room / "dense") == ColmapFolders(room / "dense" / "sparse", None, None)
+    monkeypatch.chdir(room / "sparse")
+    relative = find_colmap(Path("0"))
+    assert relative.images is not None and relative.images.samefile(room / "images")
+
+
+def test_ambiguous_and_missing_models_are_refused(room: Path) -> None:
+    model = room / "sparse" / "0"
+    shutil.copytree(model, room / "sparse" / "1")
     for path, given, message in (
-        (own, {}, "several models, give one of them: sparse/0, sparse/1"),
-        (own / "images", {}, "images: no COLMAP model: neither images.bin nor"),
-        (model, {"images": own / "none"}, "none: no such folder of images"),
-        (model, {"database": own / "images"}, "images: no such database"),
+        (room, {}, "several models, give one of them: sparse/0, sparse/1"),
+        (room / "images", {}, "images: no COLMAP model: neither images.bin nor"),
+        (model, {"images": room / "none"}, "none: no such folder of images"),
+        (model, {"database": room / "images"}, "images: no such database"),
     ):
         with pytest.raises(DataError, match=message):
             find_colmap(path, **given)
-    monkeypatch.chdir(own / "sparse")
-    relative = find_colmap(Path("0"))
-    assert relative.images is not None and relative.images.samefile(own / "images")
-    assert relative.database is not None and relative.database.samefile(own / "database.db")
 
 
-def test_what_is_missing_is_said_before_the_work(own: Path, tmp_path: Path) -> None:
-    found, output = replace(find_colmap(own), database=None), tmp_path / "map"
+def test_without_features_or_images_the_import_is_refused(room: Path, tmp_path: Path) -> None:
+    source, output = replace(find_colmap(room), database=None), tmp_path / "map"
     with pytest.raises(DataError, match="no descriptors .*--database.* or the images .*--images"):
-        import_colmap(ColmapFolders(found.model, None, None), output)
-    for gone, message in (
-        (own / "images" / "0003.jpg", "images: 1 of the model's 7 images are not here, .* 0003"),
-        (own / "sparse" / "0" / "cameras.bin", r"cameras.bin: file is missing"),
-    ):
-        gone.unlink()
-        with pytest.raises(DataError, match=message):
-            import_colmap(found, output)
+        import_colmap(ColmapFolders(source.model, None, None), output)
+    (room / "images" / "0003.jpg").unlink()
+    message = "images: 1 of the model's 7 images are not here, .* 0003"
+    with pytest.raises(DataError, match=message):
+        import_colmap(source, output)
     assert list(output.iterdir()) == []
 
 
-def test_of_images_that_are_not_there_the_database_has_the_features(
-    own: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_a_missing_image_is_tolerated_where_the_database_has_its_features(
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    before, counts = imported(find_colmap(own), tmp_path / "before")
-    (own / "images" / "0003.jpg").unlink()
-    found, again = imported(find_colmap(own), tmp_path / "map")
+    before, counts = imported(find_colmap(room), tmp_path / "before")
+    (room / "images" / "0003.jpg").unlink()
+    after, again = imported(find_colmap(room), tmp_path / "map")
     assert again == counts
     assert "1 of the model's 7 images are not here, the first is 0003.jpg" in caplog.text
-    kept = found.descriptors("sift").read("0003.jpg")
-    assert np.array_equal(kept, before.descriptors("sift").read("0003.jpg"))
+    descriptors = (folder.descriptors("sift").read("0003.jpg") for folder in (before, after))
+    np.testing.assert_array_equal(*descriptors)
 
 
-def test_the_map_is_as_large_as_its_images(
-    own: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_cameras_and_keypoints_are_scaled_to_smaller_images(
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    whole, _ = imported(find_colmap(own), tmp_path / "whole")
-    for path in [path for path in (own / "images").rglob("*") if path.is_file()]:
+    whole, _ = imported(find_colmap(room), tmp_path / "whole")
+    for path in [path for path in (room / "images").rglob("*") if path.is_file()]:
         with Image.open(path) as image:
             half = image.resize((image.width // 2, image.height // 2))
-        path.unlink()  # a link into the shared scene, perhaps
+        path.unlink()  # may be a link into the shared scene
         half.save(path)
-    found, _ = imported(find_colmap(own), tmp_path / "half")
-    assert f"{own / 'images'}: 1 cameras are scaled to their images" in caplog.text
-    name = found.read().image_names()[0]
-    large, small = whole.read().camera_of(name), found.read().camera_of(name)
+    halved, _ = imported(find_colmap(room), tmp_path / "half")
+    assert f"{room / 'images'}: 1 cameras are scaled to their images" in caplog.text
+    name = halved.read().image_names()[0]
+    large, small = whole.read().camera_of(name), halved.read().camera_of(name)
     assert (small.width, small.height) == (large.width // 2, large.height // 2)
     np.testing.assert_allclose(small.params, np.array(large.params) / 2)
     np.testing.assert_allclose(
-        found.keypoints("sift").read(name), whole.keypoints("sift").read(name) / 2
+        halved.keypoints("sift").read(name), whole.keypoints("sift").read(name) / 2
     )
-    found.validate(deep=True)
-    Image.new("RGB", (50, 50)).save(own / "images" / name)
-    with pytest.raises(DataError, match=f"{own}.*{name}.*50x50, its camera says.*--images"):
-        imported(find_colmap(own), tmp_path / "third")
+    halved.validate(deep=True)
+    Image.new("RGB", (50, 50)).save(room / "images" / name)
+    with pytest.raises(DataError, match=f"{room}.*{name}.*50x50, its camera says.*--images"):
+        imported(find_colmap(room), tmp_path / "third")
 
 
 def test_features_of_a_model_that_are_not_available(
-    own: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    found = find_colmap(own)
-    model = pycolmap.Reconstruction(found.model)
+    source = find_colmap(room)
+    model = pycolmap.Reconstruction(source.model)
     for image in model.images.values():
         for point in image.points2D:
             point.xy = point.xy + [5.3, 2.6]  # nowhere near SIFT's keypoints
-    model.write_binary(found.model)
-    assert import_colmap(replace(found, database=None), tmp_path / "map") is None
+    model.write_binary(source.model)
+    assert import_colmap(replace(source, database=None), tmp_path / "map") is None
     assert "sparse/0: the model has no descriptors" in caplog.text
     model.delete_all_points2D_and_points3D()
-    model.write_binary(found.model)
-    assert import_colmap(find_colmap(own), tmp_path / "none") is None
+    model.write_binary(source.model)
+    assert import_colmap(find_colmap(room), tmp_path / "none") is None
     assert "sparse/0: the model has no points" in caplog.text

@@ -16,24 +16,18 @@ from megloc_kapture.datasets.kapture_folders import (
 from megloc_kapture.errors import DataError
 from megloc_kapture.io import dataset_tables as tables
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.values import Camera, RigidTransform
-
-CAMERA = Camera("SIMPLE_PINHOLE", 8, 6, (10.0, 4.0, 3.0))
+from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
+from megloc_kapture.values import RigidTransform
+from tests.worlds import SMALL_CAMERA, one_camera
 
 
 def write_part(
     root: Path, part: str, names: Sequence[str], *, poses: bool, images: bool = True
 ) -> None:
-    data = KaptureData(sensors={"cam": Sensor.from_camera(CAMERA)})
-    for timestamp, name in enumerate(names):
-        data.records_camera[timestamp, "cam"] = name
-        if poses:
-            data.trajectories[timestamp, "cam"] = RigidTransform.identity()
-        if images:
-            path = root / part / "sensors" / "records_data" / name
-            write_image(path, np.full((6, 8, 3), 99, np.uint8))
-    write_sensors(root / part, data)
+    write_sensors(root / part, one_camera(names, RigidTransform.identity() if poses else None))
+    for name in names if images else ():
+        path = root / part / "sensors" / "records_data" / name
+        write_image(path, np.full((6, 8, 3), 99, np.uint8))
 
 
 @pytest.fixture
@@ -46,14 +40,16 @@ def root(tmp_path: Path) -> Path:
     return place
 
 
-def test_what_is_imported(root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_folders_are_written_with_links_to_the_images_and_without_poses_of_queries(
+    root: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     counts = {"map_images": 2, "map_images_with_pose": 2, "queries": 2, "queries_with_truth": 2}
     assert import_kapture_folders(root, out) == counts
     mapping, query = KaptureFolder(out / "mapping"), KaptureFolder(out / "query")
     assert mapping.read().poses().keys() == {"a.png", "b/c.png"}
     assert query.read().image_names() == ["b/q.png", "r.png"]
-    # the queries' poses are nobody's business but the evaluation's
+    # poses of queries are for the evaluation only
     assert query.read().poses() == {}
     assert len(KaptureFolder(out / "query_gt").read().poses()) == 2
     images = root / "mapping/sensors/records_data"
@@ -61,18 +57,23 @@ def test_what_is_imported(root: Path, tmp_path: Path, caplog: pytest.LogCaptureF
     assert query.image_path("b/q.png").is_file()
     assert tables.read_protocol(out / "megloc") == tables.Protocol()
     assert sorted(path.name for path in (out / "megloc").iterdir()) == ["protocol.json"]
+
+
+def test_truth_is_optional_and_may_have_other_images(
+    root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     write_part(root, "query_gt", ["b/q.png", "s.png"], poses=True, images=False)
-    assert import_kapture_folders(root, tmp_path / "c") == counts | {"queries_with_truth": 1}
+    assert import_kapture_folders(root, tmp_path / "a")["queries_with_truth"] == 1
     assert "query_gt: true poses of 1 images that are no query" in caplog.text
     (root / "query_gt/sensors/sensors.txt").unlink()
-    assert import_kapture_folders(root, tmp_path / "b") == counts | {"queries_with_truth": 0}
+    assert import_kapture_folders(root, tmp_path / "b")["queries_with_truth"] == 0
     assert not (tmp_path / "b" / "query_gt").exists()
 
 
 @pytest.mark.parametrize("prefix", ["", "q"])
 def test_queries_keep_their_depth_and_masks(root: Path, tmp_path: Path, prefix: str) -> None:
     data = KaptureFolder(root / "query").read()
-    data.sensors["depth"] = Sensor.from_camera(CAMERA, sensor_type="depth")
+    data.sensors["depth"] = Sensor.from_camera(SMALL_CAMERA, sensor_type="depth")
     data.rigs["rig"] = {name: RigidTransform.identity() for name in ("cam", "depth")}
     data.records_depth[0, "depth"] = "b/q.depth"
     write_sensors(root / "query", data)
@@ -81,19 +82,19 @@ def test_queries_keep_their_depth_and_masks(root: Path, tmp_path: Path, prefix: 
     before = set(input_files(root))
     depth.write_bytes(np.ones((6, 8), np.float32).tobytes())
     write_image(mask, np.zeros((6, 8), np.uint8))
-    # another depth map is another data set
+    # depth maps and masks are inputs of the import
     assert set(input_files(root)) - before == {depth, mask}
     import_kapture_folders(root, tmp_path / "out", query_prefix=prefix)
     query = KaptureFolder(tmp_path / "out" / "query")
     (name,) = query.read().records_depth.values()
     assert query.depth_path(name).read_bytes() == depth.read_bytes()
-    there = query.root / "sensors" / "masks" / prefix / "r.png.png"
-    assert there.read_bytes() == mask.read_bytes()
+    copy = query.root / "sensors" / "masks" / prefix / "r.png.png"
+    assert copy.read_bytes() == mask.read_bytes()
     assert query.read().poses() == {}
     assert KaptureFolder(tmp_path / "out" / "query_gt").read().records_depth == {}
 
 
-def test_side_tables_come_along(root: Path, tmp_path: Path) -> None:
+def test_side_tables_are_imported_with_prefixed_queries(root: Path, tmp_path: Path) -> None:
     given, out = root / "megloc", tmp_path / "out" / "megloc"
     of_map = tables.ImageGroup(frame="f")
     of_query = tables.ImageGroup(condition="night", scored=False)
@@ -123,7 +124,7 @@ def test_side_tables_come_along(root: Path, tmp_path: Path) -> None:
     assert tables.read_protocol(out) == protocol.model_copy(update=change)
 
 
-def test_equal_names_are_refused_or_prefixed(root: Path, tmp_path: Path) -> None:
+def test_equal_names_of_map_and_queries_need_a_prefix(root: Path, tmp_path: Path) -> None:
     write_part(root, "query", ["a.png", "r.png"], poses=False)
     write_part(root, "query_gt", ["a.png", "r.png"], poses=True, images=False)
     night = tables.ImageGroup(condition="night")
@@ -137,7 +138,7 @@ def test_equal_names_are_refused_or_prefixed(root: Path, tmp_path: Path) -> None
     assert query.image_path("some/where/a.png").is_file()
     truth = KaptureFolder(out / "query_gt").read()
     assert truth.poses().keys() == {"some/where/a.png", "some/where/r.png"}
-    # the table cannot tell which of the two it means
+    # the table applies to both images of the name
     assert tables.read_groups(out / "megloc") == {"a.png": night, "some/where/a.png": night}
 
 
@@ -148,7 +149,7 @@ def test_equal_names_are_refused_or_prefixed(root: Path, tmp_path: Path) -> None
         ("query", [], r"root/query: there are no query images"),
     ],
 )
-def test_too_little_is_refused(
+def test_a_map_without_poses_or_no_queries_are_refused(
     root: Path, tmp_path: Path, part: str, names: list[str], message: str
 ) -> None:
     shutil.rmtree(root / part)
@@ -157,10 +158,10 @@ def test_too_little_is_refused(
         import_kapture_folders(root, tmp_path / "out")
 
 
-def test_every_file_an_import_reads_counts(root: Path) -> None:
+def test_the_input_files_are_all_files_that_an_import_reads(root: Path) -> None:
     write_image(root / "query/sensors/masks/r.png.png", np.zeros((6, 8), np.uint8))
     tables.write_priors(root / "megloc", {"r.png": ["a.png"]})
     read = {path for path in root.rglob("*") if path.is_file()}
     (root / "notes.txt").write_text("no input")
-    found = list(input_files(root))
-    assert set(found) == read and len(found) == len(read)
+    files = list(input_files(root))
+    assert set(files) == read and len(files) == len(read)

@@ -1,4 +1,4 @@
-"""What adapters return becomes kapture folders, the same way for every dataset."""
+"""The kapture folders written of the records and tables of any dataset."""
 
 from __future__ import annotations
 
@@ -18,20 +18,11 @@ from megloc_kapture.datasets.official import (
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.io import dataset_tables as tables
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.values import RigidTransform
+from tests.worlds import one_camera
 
-CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))
 POSE = RigidTransform((0.5, 0.5, -0.5, 0.5), (1.0, 2.0, 3.0))
-
-
-def records(*names: str, poses: bool = False) -> KaptureData:
-    data = KaptureData(sensors={"cam": CAMERA})
-    for timestamp, name in enumerate(names):
-        data.records_camera[timestamp, "cam"] = name
-        if poses:
-            data.trajectories[timestamp, "cam"] = POSE
-    return data
 
 
 @pytest.fixture
@@ -43,9 +34,9 @@ def dataset(tmp_path: Path) -> OfficialDataset:
         (images / name).write_bytes(name.encode())
     moved = tables.SimilarityTransform(translation=(1e6, 0.0, 0.0))
     return OfficialDataset(
-        mapping=records("db/1.jpg", "db/2.jpg", poses=True),
-        query=records("query/3.jpg"),
-        query_gt=records("query/3.jpg", poses=True),
+        mapping=one_camera(["db/1.jpg", "db/2.jpg"], POSE),
+        query=one_camera(["query/3.jpg"]),
+        query_gt=one_camera(["query/3.jpg"], POSE),
         links={"": images},
         protocol=tables.Protocol(dataset="toy"),
         groups={"query/3.jpg": tables.ImageGroup(condition="day")},
@@ -63,8 +54,8 @@ def test_folders_and_tables_are_written_and_images_linked(
     write_official(dataset, out)
     for part, names in (("mapping", ["db/1.jpg", "db/2.jpg"]), ("query", ["query/3.jpg"])):
         theirs = kapture_from_dir(str(out / part))
-        found = [image for _, _, image in kapture.flatten(theirs.records_camera)]
-        assert sorted(found) == names
+        images = [image for _, _, image in kapture.flatten(theirs.records_camera)]
+        assert sorted(images) == names
         folder = KaptureFolder(out / part)
         assert folder.image_path(names[0]).read_bytes() == names[0].encode()
         assert (out / part / "sensors" / "records_data").is_symlink()
@@ -79,9 +70,7 @@ def test_folders_and_tables_are_written_and_images_linked(
     assert tables.read_protocol(written) == dataset.protocol
 
 
-def test_what_is_missing_is_refused_folder_by_folder(
-    dataset: OfficialDataset, tmp_path: Path
-) -> None:
+def test_missing_files_are_summarised_by_folder(dataset: OfficialDataset, tmp_path: Path) -> None:
     root = tmp_path / "official"
     missing = Missing(root)
     assert missing.require(root / "images/db/1.jpg")
@@ -100,34 +89,31 @@ def test_what_is_missing_is_refused_folder_by_folder(
 @pytest.mark.parametrize(
     ("part", "message"),
     [
-        ({"mapping": records("db/1.jpg")}, "no mapping image with a pose is left"),
+        ({"mapping": one_camera(["db/1.jpg"])}, "no mapping image with a pose is left"),
         ({"query": KaptureData()}, "no query image is left"),
-        ({"query": records("db/2.jpg")}, "image 'db/2.jpg' is in the map and a query"),
+        ({"query": one_camera(["db/2.jpg"])}, "image 'db/2.jpg' is in the map and a query"),
     ],
 )
-def test_nothing_useful_is_refused(
+def test_a_dataset_without_map_or_queries_or_with_shared_images_is_refused(
     dataset: OfficialDataset, tmp_path: Path, part: dict[str, KaptureData], message: str
 ) -> None:
     with pytest.raises(DataError, match=message):
         write_official(replace(dataset, **part), tmp_path / "out")  # type: ignore[arg-type]
 
 
-def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(
+def test_additional_truth_is_converted_to_the_local_frame(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     moved = tables.SimilarityTransform(quat_wxyz=(0.5, 0.5, 0.5, 0.5), translation=(4e6, 1e6, -2e6))
     world = tables.World(official_from_local=moved)
-    assert read_ground_truth(tmp_path, records("q/1.jpg"), world) == (None, {})
+    assert read_ground_truth(tmp_path, one_camera(["q/1.jpg"]), world) == (None, {})
     truth = tmp_path / "ground_truth"
-    write_sensors(truth / "query", records("q/1.jpg", "q/2.jpg", poses=True))
+    write_sensors(truth / "query", one_camera(["q/1.jpg", "q/2.jpg"], POSE))
     tables.write_groups(truth / "megloc", {"q/1.jpg": tables.ImageGroup(condition="DUC1")})
-    found, groups = read_ground_truth(tmp_path, records("q/0.jpg", "q/1.jpg"), world)
-    assert found is not None and list(found.poses()) == ["q/1.jpg"]
+    poses, groups = read_ground_truth(tmp_path, one_camera(["q/0.jpg", "q/1.jpg"]), world)
+    assert poses is not None and list(poses.poses()) == ["q/1.jpg"]
     assert groups == {"q/1.jpg": tables.ImageGroup(condition="DUC1")}
-    back = world.pose_in_official(found.poses()["q/1.jpg"])
+    back = world.pose_in_official(poses.poses()["q/1.jpg"])
     np.testing.assert_allclose(back.center(), POSE.center(), atol=1e-6)
     np.testing.assert_allclose(back.quat_wxyz, POSE.quat_wxyz, atol=1e-12)
     assert "true poses of 1 images that are no query are left out, the first is q/2" in caplog.text
-    (truth / "query" / "sensors" / "sensors.txt").unlink()
-    with pytest.raises(DataError, match="sensors.txt: cannot read: the file is missing"):
-        read_ground_truth(tmp_path, records("q/1.jpg"), world)

@@ -1,7 +1,8 @@
-"""A sparse model as a kapture map: read back by kapture itself, and localizable."""
+"""A sparse model as a kapture map, with the features of a COLMAP database or without."""
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,16 @@ import numpy as np
 import pytest
 from kapture.converter.colmap.database import COLMAPDatabase
 
-from megloc_kapture.datasets.reference_map import write_reference_map
+from megloc_kapture.datasets.reference_map import ColmapDatabase, write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap_model import SparsePoints
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
+from tests.worlds import one_camera
 
-# as a model lists them: not sorted, and one image that was not imported
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
+# unsorted, with an image that is not imported
 NAMES = ("db/b.jpg", "db/a.jpg", "gone/c.jpg", "db/d.jpg")
 # point, image, feature, x, y
 ROWS = [
@@ -45,13 +49,9 @@ def points() -> SparsePoints:
     )
 
 
-def data(names: tuple[str, ...] = ("db/a.jpg", "db/b.jpg", "db/d.jpg")) -> KaptureData:
-    result = KaptureData()
-    result.sensors["cam"] = Sensor.from_camera(Camera("PINHOLE", 64, 48, (50, 50, 32, 24)))
-    for time, name in enumerate(names):
-        result.records_camera[time, "cam"] = name
-        result.trajectories[time, "cam"] = RigidTransform((1.0, 0.0, 0.0, 0.0), (time, 0.0, 0.0))
-    return result
+def data() -> KaptureData:
+    names = ("db/a.jpg", "db/b.jpg", "db/d.jpg")
+    return one_camera(names, RigidTransform.identity(), camera=Camera.pinhole(64, 48, 50))
 
 
 def keypoints_by_kapture(folder: Path, image: str) -> Any:
@@ -59,7 +59,7 @@ def keypoints_by_kapture(folder: Path, image: str) -> Any:
     return kapture.io.features.image_keypoints_from_file(path, np.float32, 2)
 
 
-def test_kapture_reads_the_map(tmp_path: Path) -> None:
+def test_kapture_reads_the_points_and_observations_of_the_model(tmp_path: Path) -> None:
     photographs, output = tmp_path / "images", tmp_path / "reference"
     photographs.mkdir()
     counts = write_reference_map(output, data(), {"": photographs}, NAMES, points())
@@ -73,7 +73,7 @@ def test_kapture_reads_the_map(tmp_path: Path) -> None:
     table = read.points3d.as_array()
     assert np.array_equal(table[:, :3], np.arange(12.0).reshape(4, 3) / 7)
     assert np.array_equal(table[:, 3:], np.arange(12.0).reshape(4, 3))
-    # numbered without gaps, in the order of the model's ids
+    # keypoints are numbered without gaps, in the order of the model's ids
     assert keypoints_by_kapture(output, "db/b.jpg").tolist() == [[5, 6], [1, 2]]
     assert keypoints_by_kapture(output, "db/a.jpg").tolist() == [[7, 8], [3, 4]]
     assert read.keypoints["sift"] == {"db/a.jpg", "db/b.jpg"}
@@ -88,7 +88,7 @@ def test_kapture_reads_the_map(tmp_path: Path) -> None:
 def write_database(
     path: Path, names: dict[str, int], *, shift: float = 0.0, descriptors: int | None = None
 ) -> dict[str, tuple[Any, Any]]:
-    """Features that agree with ROWS; ``names`` gives how many each image of the database has."""
+    """Write features that agree with ROWS, of the schema before version 4; counts by name."""
     rng = np.random.default_rng(1)
     database = COLMAPDatabase.connect(str(path))
     database.create_tables()
@@ -113,7 +113,7 @@ def write_database(
 FEATURES = {"db/a.png": 10, "db/b.png": 901, "db/d.png": 0, "other.png": 2}
 
 
-def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None:
+def test_all_features_of_a_database_keep_their_numbers(tmp_path: Path) -> None:
     written = write_database(tmp_path / "d.db", FEATURES, shift=0.01)
     output = tmp_path / "map"
     counts = write_reference_map(output, data(), {}, NAMES, points(), database=tmp_path / "d.db")
@@ -122,18 +122,17 @@ def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None
     folder.validate()
     for name in ("a", "b"):
         keypoints, descriptors = written[f"db/{name}.png"]
-        found = folder.keypoints("sift").read(f"db/{name}.jpg")
-        assert np.array_equal(found, keypoints[:, :2])
+        read = folder.keypoints("sift").read(f"db/{name}.jpg")
+        assert np.array_equal(read, keypoints[:, :2])
         assert np.array_equal(folder.descriptors("sift").read(f"db/{name}.jpg"), descriptors)
     config = folder.descriptors("sift").config
     assert (config.keypoints_type, config.metric_type) == ("sift", "L2")
-    # all images have features, if none: so they can be matched
+    # images without keypoints have empty arrays
     assert folder.keypoints("sift").names == ["db/a.jpg", "db/b.jpg", "db/d.jpg"]
     assert folder.keypoints("sift").read("db/d.jpg").shape == (0, 2)
     assert folder.descriptors("sift").read("db/d.jpg").shape == (0, 128)
-    read = kapture.io.csv.kapture_from_dir(str(output))
-    assert read.descriptors["sift"] == {"db/a.jpg", "db/b.jpg", "db/d.jpg"}
-    assert read.observations[0, "sift"] == [("db/b.jpg", 900), ("db/a.jpg", 7), ("db/b.jpg", 4)]
+    theirs = kapture.io.csv.kapture_from_dir(str(output))
+    assert theirs.observations[0, "sift"] == [("db/b.jpg", 900), ("db/a.jpg", 7), ("db/b.jpg", 4)]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +144,7 @@ def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None
         (FEATURES, {"descriptors": 9}, r"descriptors of 'db/a.jpg' have the shape \(9, 128\)"),
     ],
 )
-def test_another_model_s_database_is_refused(
+def test_the_database_of_another_model_is_refused(
     tmp_path: Path, names: dict[str, int], options: dict[str, Any], match: str
 ) -> None:
     path = tmp_path / "d.db"
@@ -155,11 +154,83 @@ def test_another_model_s_database_is_refused(
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_the_exact_name_comes_before_another_suffix(tmp_path: Path) -> None:
+def test_the_exact_name_takes_precedence_over_another_suffix(tmp_path: Path) -> None:
     names = {"db/a.jpg": 10, "db/a.png": 10, "db/b.jpg": 901}
     written = write_database(tmp_path / "d.db", names)
     write_reference_map(tmp_path, data(), {}, NAMES, points(), database=tmp_path / "d.db")
-    # an image that the database does not have
+    # an image that is not in the database
     assert KaptureFolder(tmp_path).descriptors("sift").read("db/d.jpg").shape == (0, 128)
-    found = KaptureFolder(tmp_path).keypoints("sift").read("db/a.jpg")
-    assert np.array_equal(found, written["db/a.jpg"][0][:, :2])
+    read = KaptureFolder(tmp_path).keypoints("sift").read("db/a.jpg")
+    assert np.array_equal(read, written["db/a.jpg"][0][:, :2])
+
+
+# ------------------------------------------------------------------ the database
+
+
+def write_with_pycolmap(path: Path) -> dict[str, tuple[Any, Any]]:
+    """Write the schema of version 4, in WAL mode."""
+    rng = np.random.default_rng(0)
+    database = pycolmap.Database.open(str(path))
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[50.0, 32, 24])
+    camera_id = database.write_camera(camera)
+    written = {}
+    for name, count in {"db/7.jpg": 5, "rear/8.png": 3, "c.jpg": 0}.items():
+        image_id = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+        keypoints = rng.uniform(0, 1000, (count, 4)).astype(np.float32)
+        values = rng.integers(0, 256, (count, 128)).astype(np.uint8)
+        database.write_keypoints(image_id, keypoints)
+        kind = pycolmap.FeatureExtractorType.SIFT
+        database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, values))
+        written[name] = (keypoints, values)
+    database.close()
+    return written
+
+
+def test_a_database_is_read_and_stays_unchanged(tmp_path: Path) -> None:
+    path = tmp_path / "all of it?#100%.db"
+    written = write_with_pycolmap(tmp_path / "plain.db")
+    (tmp_path / "plain.db").rename(path)
+    before = sorted(tmp_path.iterdir()), path.read_bytes()
+    with ColmapDatabase(path) as database:
+        assert list(database.images) == sorted(written)
+        for name, (keypoints, descriptors) in written.items():
+            assert np.array_equal(database.keypoints(name), keypoints[:, :2])
+            values = database.descriptors(name)
+            assert (values is None) == (len(keypoints) == 0)
+            assert values is None or np.array_equal(values, descriptors)
+        with pytest.raises(DataError, match="has no image 'd.jpg'"):
+            database.keypoints("d.jpg")
+        assert sorted(tmp_path.iterdir()) == before[0]  # no files of SQLite
+    assert (sorted(tmp_path.iterdir()), path.read_bytes()) == before
+
+
+def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "d.db"
+    write_with_pycolmap(path)
+    writer = sqlite3.connect(path)
+    writer.execute("UPDATE images SET name = 'new.jpg' WHERE image_id = 1")
+    writer.commit()
+    assert (tmp_path / "d.db-wal").stat().st_size > 0
+    with pytest.raises(DataError, match=r"d\.db: was not closed: the content of d\.db-wal"):
+        ColmapDatabase(path)
+    writer.close()
+    with ColmapDatabase(path) as database:
+        assert "new.jpg" in database.images
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE images SET name = '../a' WHERE image_id = 1", "leads out of its folder"),
+        ("UPDATE keypoints SET rows = 4", "not a COLMAP database"),
+        ("DROP TABLE images", "no such table: images"),
+    ],
+)
+def test_a_damaged_database_is_named(tmp_path: Path, statement: str, message: str) -> None:
+    path = tmp_path / "d.db"
+    write_database(path, FEATURES)
+    with sqlite3.connect(path) as connection:
+        connection.execute(statement)
+    connection.close()
+    with pytest.raises(DataError, match=rf"d\.db: .*{message}"), ColmapDatabase(path) as database:
+        database.keypoints("db/a.png")

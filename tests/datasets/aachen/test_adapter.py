@@ -1,8 +1,7 @@
-"""Aachen Day-Night: what its official layout becomes, on small layouts written by hand."""
+"""Aachen Day-Night in its official layout, on small layouts written by hand."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,19 +74,19 @@ def assert_poses(data: KaptureData) -> None:
         np.testing.assert_allclose(poses[name].matrix(), pose.matrix(), rtol=0, atol=1e-9)
 
 
-def test_version_10(root: Path, tmp_path: Path) -> None:
+def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     out = written(root, tmp_path / "out")
     mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
     assert mapping.poses().keys() == POSES.keys()
     assert_poses(mapping)
-    # cameras are those of the list, found by name
+    # the list has the cameras by name
     assert mapping.camera_of("db/7.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (10.5, 4, 3, -0.08))
     assert mapping.camera_of("db/3.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (12, 4.25, 3, -0.25))
     assert mapping.camera_of("db/1228.jpg") == Camera("SIMPLE_RADIAL", 6, 8, (11, 3, 4, 0.5))
     assert [mapping.record_of(name) for name in DATABASE] == [
         (position, f"camera_{position:05d}") for position in range(3)
     ]
-    # no query but those of the lists, and none with a pose
+    # queries are those of the lists, without poses
     assert query.image_names() == sorted(DAY + NIGHT)
     assert query.trajectories == {}
     assert all(query.camera_of(name) == QUERY_CAMERA for name in DAY + NIGHT)
@@ -98,7 +97,7 @@ def test_version_10(root: Path, tmp_path: Path) -> None:
         assert KaptureFolder(out / part).image_path(name).samefile(root / "images_upright" / name)
 
 
-def test_version_11(root11: Path, tmp_path: Path) -> None:
+def test_version_1_1_is_read(root11: Path, tmp_path: Path) -> None:
     out = written(root11, tmp_path / "out")
     mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
     assert mapping.poses().keys() == {*DATABASE, *SEQUENCE}
@@ -117,7 +116,9 @@ def test_version_11(root11: Path, tmp_path: Path) -> None:
     assert len(kapture_from_dir(str(out / "query")).records_camera.data_list()) == 5
 
 
-def test_side_tables(root11: Path, tmp_path: Path) -> None:
+def test_tables_have_the_names_conditions_and_protocol_of_the_challenge(
+    root11: Path, tmp_path: Path
+) -> None:
     tables = written(root11, tmp_path / "out") / "megloc"
     # in the order of the lists, day first
     names = list(read_names(tables).items())
@@ -131,7 +132,7 @@ def test_side_tables(root11: Path, tmp_path: Path) -> None:
     assert protocol.thresholds == ((0.25, 2), (0.5, 5), (5, 10))
     assert (protocol.pose_file, protocol.pose_file_names) == ("ltvl", "basename")
     assert "visuallocalization.net" in protocol.truth
-    # both models are there: the version that is read is the version that is handed in
+    # the pose file is named after the version that is read
     assert protocol.pose_file_stem == "Aachen_v1_1"
     assert read(root11, version="1.0").protocol.pose_file_stem == "Aachen"
     assert not (tables / "priors.csv").exists()
@@ -139,7 +140,7 @@ def test_side_tables(root11: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("folder", ["aachen_v_1_1", "aachen_v1_1"])
 @pytest.mark.parametrize("images", ["images_upright", "images/images_upright"])
-def test_folders_that_are_met_with_other_names(root11: Path, folder: str, images: str) -> None:
+def test_other_names_of_folders_are_accepted(root11: Path, folder: str, images: str) -> None:
     models = root11 / "3D-models"
     (models / "aachen_v_1_1").rename(models / folder)
     (root11 / images).parent.mkdir(exist_ok=True)
@@ -150,19 +151,14 @@ def test_folders_that_are_met_with_other_names(root11: Path, folder: str, images
     assert dataset.missing is not None and dataset.missing.files == []
 
 
-def test_missing_files_are_refused_or_passed_over(root11: Path, tmp_path: Path) -> None:
+def test_images_keep_their_ids_where_others_are_missing(root11: Path, tmp_path: Path) -> None:
     gone = {DATABASE[0], SEQUENCE[1], DAY[1], ADDED[0]}
     for name in gone:
         (root11 / "images_upright" / name).unlink()
-    with pytest.raises(DataError, match=r"4 files are missing: .*db/7\.jpg") as caught:
-        written(root11, tmp_path / "no")
-    assert str(caught.value).startswith(str(root11))
-    assert not (tmp_path / "no").exists()
-    written(root11, tmp_path / "out", allow_missing=True)
-    mapping, query = (KaptureFolder(tmp_path / "out" / p).read() for p in ("mapping", "query"))
+    out = written(root11, tmp_path / "out", allow_missing=True)
+    mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
     assert mapping.image_names() == sorted({*DATABASE, *SEQUENCE} - gone)
-    assert list(read_names(tmp_path / "out/megloc")) == [DAY[0], DAY[2], NIGHT[0]]
-    # what is left keeps its ids
+    assert list(read_names(out / "megloc")) == [DAY[0], DAY[2], NIGHT[0]]
     assert mapping.record_of("db/3.jpg")[1] == "camera_00009"
     assert query.record_of(DAY[2]) == (100_002, "day_00002")
     assert query.record_of(NIGHT[0]) == (200_001, "night_00001")
@@ -172,39 +168,31 @@ def test_missing_files_are_refused_or_passed_over(root11: Path, tmp_path: Path) 
     ("change", "where", "match"),
     [
         (edit(LIST, "db/7.jpg", "db/8.jpg"), LIST, "no line for 'db/7.jpg'"),
-        (edit(LIST, " 10.5 ", " nan "), f"{LIST}:2", "parameters must be finite"),
-        (edit(MODEL, "\n2\n", "\n3\n"), MODEL, "ends before its last point"),
         (edit(DAY_LIST, DAY[2], DAY[0]), f"{DAY_LIST}:3", "is listed twice"),
         (edit(MODEL, NVM, NVM + NVM[9:]), MODEL, "several models, expected one"),
     ],
 )
-def test_broken_files_are_named(
+def test_contradictory_lists_are_named(
     root: Path, change: Callable[[Path], None], where: str, match: str
 ) -> None:
     change(root)
     with pytest.raises(DataError, match=match) as caught:
         read(root)
     assert str(caught.value).startswith(f"{root / where}: ")
-    assert "\n" not in str(caught.value)
 
 
-def test_a_folder_that_is_another(root: Path, tmp_path: Path) -> None:
-    def refused(place: Path, message: str, **options: object) -> None:
-        with pytest.raises(DataError, match=message):
-            Aachen(AachenOptions(**options)).check(place)  # type: ignore[arg-type]
-
-    refused(tmp_path / "absent", "no folder images_upright and queries and 3D-models")
-    refused(root, r"v1\.1 is missing: 3D-models/aachen_v_1_1", version="1.1")
-    (root / "3D-models/aachen_v_1_1").mkdir()
-    refused(root, "aachen_v_1_1: no COLMAP model")
-    (root / "3D-models/aachen_v_1_1").rmdir()
+def test_the_model_of_the_chosen_version_is_required(root: Path) -> None:
+    with pytest.raises(DataError, match=r"v1\.1 is missing: 3D-models/aachen_v_1_1"):
+        Aachen(AachenOptions(version="1.1")).check(root)
     (root / MODEL).unlink()
-    refused(root, r"v1\.0 is missing: 3D-models/aachen_cvpr2018_db\.nvm")
-    shutil.rmtree(root / "queries")
-    refused(root, "no folder queries; the root must contain images_upright")
+    with pytest.raises(DataError, match=r"v1\.0 is missing: 3D-models/aachen_cvpr2018_db\.nvm"):
+        Aachen().check(root)
+    (root / "3D-models/aachen_v_1_1").mkdir()
+    with pytest.raises(DataError, match="aachen_v_1_1: no COLMAP model"):
+        Aachen().check(root)
 
 
-def test_reference_model(root: Path, tmp_path: Path) -> None:
+def test_the_reference_model_is_imported_on_request(root: Path, tmp_path: Path) -> None:
     assert not (written(root, tmp_path / "plain") / "reference").exists()
     output = written(root, tmp_path / "out", reference_model=True) / "reference"
     theirs = kapture_from_dir(str(output))

@@ -1,4 +1,4 @@
-"""Aachen Day-Night in kapture folders that kapture's own importers made of its official layout."""
+"""Aachen Day-Night in kapture folders, made by kapture's importers of the official layout."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def downloaded(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What kapture's downloader leaves: mapping/, query_day/ and query_night/."""
+    """The layout of kapture's downloader: mapping/, query_day/ and query_night/."""
     return aachen_with_kapture(official, tmp_path_factory.mktemp("kapture") / "Aachen-Day-Night")
 
 
@@ -42,28 +42,28 @@ def read(root: Path, **options: object) -> OfficialDataset:
     return Aachen(AachenOptions(**options)).read(root)  # type: ignore[arg-type]
 
 
-def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, tmp_path: Path) -> None:
-    expected, found = read(official), read(downloaded)
+def test_both_forms_give_the_same_dataset(official: Path, downloaded: Path, tmp_path: Path) -> None:
+    expected, actual = read(official), read(downloaded)
     assert len(expected.names) == 5 and expected.protocol.pose_file_stem == "Aachen_v1_1"
-    assert_same_dataset(found, expected)
-    assert_linked(found, tmp_path / "out", official / "images_upright")
+    assert_same_dataset(actual, expected)
+    assert_linked(actual, tmp_path / "out", official / "images_upright")
     assert kapture_from_dir(str(tmp_path / "out" / "query")).trajectories is None
 
 
-def test_queries_that_kapture_merged(official: Path, downloaded: Path, root: Path) -> None:
+def test_queries_merged_by_kapture_are_read(official: Path, downloaded: Path, root: Path) -> None:
     parts = [downloaded / part for part in PARTS]
     images = ["--image_transfer", "link_absolute"]
     kapture_tool("kapture_merge", "-i", *parts, "-o", root / "query", *images)
-    assert_same_dataset(read(root), read(official))  # as kapture's scripts leave it
+    assert_same_dataset(read(root), read(official))  # the layout of kapture's scripts
     for part in PARTS:
         shutil.rmtree(root / part)
     assert_same_dataset(read(root), read(official))
 
 
-def test_kapture_folders_in_a_folder_of_their_own(
+def test_kapture_folders_may_be_in_a_subfolder(
     official: Path, downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = tmp_path / "Aachen-Day-Night-v1.1"  # what kapture unpacks to
+    place = tmp_path / "Aachen-Day-Night-v1.1"  # the name in kapture's archive
     place.mkdir()
     (place / "kapture").symlink_to(downloaded)
     assert_same_dataset(read(place), read(official))
@@ -71,16 +71,16 @@ def test_kapture_folders_in_a_folder_of_their_own(
     choice = choose_dataset("aachen", None)
     choice.check()
     assert choice.root == place
-    # the official files come first
+    # official files take precedence
     shutil.copytree(official, place, dirs_exist_ok=True)
     assert read(place).links == {"": place / "images_upright"}
 
 
-def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
+def test_the_name_of_the_pose_file_follows_the_version(downloaded: Path, root: Path) -> None:
     for part, gone in (("mapping", "sequences/"), ("query_night", "_additional_night/")):
         without_images(root / part, gone)
     assert read(root).protocol.pose_file_stem == "Aachen"
-    # the added queries alone are v1.1's, and so is the folder's name
+    # the additional queries alone, or the name of the folder, show version 1.1
     shutil.rmtree(root / "query_night")
     shutil.copytree(downloaded / "query_night", root / "query_night", symlinks=True)
     assert read(root).protocol.pose_file_stem == "Aachen_v1_1"
@@ -91,7 +91,7 @@ def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
 
 
 def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
-    """Cameras and poses by image, as kapture reads them; names of sensors are each tool's own."""
+    """Return cameras and poses by image, as kapture reads them."""
     data = kapture_from_dir(str(folder))
     poses = data.trajectories or {}
     return {
@@ -101,14 +101,14 @@ def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
 
 
 def assert_same_kapture(ours: Path, theirs: Path) -> None:
-    found, expected = images_of(ours), images_of(theirs)
-    assert found.keys() == expected.keys() and len(found) > 2
+    actual, expected = images_of(ours), images_of(theirs)
+    assert actual.keys() == expected.keys() and len(actual) > 2
     for name, (params, pose) in expected.items():
-        own_params, own = found[name]
-        assert own_params == params and (own is None) == (pose is None)
+        our_params, our_pose = actual[name]
+        assert our_params == params and (our_pose is None) == (pose is None)
         if pose is not None:
-            np.testing.assert_allclose(own.t_raw, pose.t_raw, rtol=0, atol=1e-9)
-            turns = (Rotation.from_quat(one.r_raw, scalar_first=True) for one in (own, pose))
+            np.testing.assert_allclose(our_pose.t_raw, pose.t_raw, rtol=0, atol=1e-9)
+            turns = (Rotation.from_quat(p.r_raw, scalar_first=True) for p in (our_pose, pose))
             assert np.degrees((next(turns) * next(turns).inv()).magnitude()) < 1e-9
 
 
@@ -121,7 +121,7 @@ def sample(shared_data: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_the_sample_is_what_kapture_makes_of_it(sample: Path, tmp_path: Path) -> None:
+def test_kapture_imports_the_published_sample_equally(sample: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     write_official(read(sample), out, allow_missing=True)
     assert_same_kapture(out / "mapping", sample / "kapture/training")

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets import nvm as nvm_reader
 from megloc_kapture.datasets.nvm import NvmModel, read_nvm
-from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.images import write_image
 
@@ -32,9 +31,9 @@ MODEL = ["2", CAMERA, TURNED, "", "3", *POINTS]
 ARRAYS = ("xyz", "rgb", "point_ids", "image_ids", "feature_ids", "xy_px")
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let borders of blocks be everywhere."""
+    """Read two rows at a time."""
     monkeypatch.setattr(nvm_reader, "_ROWS", 2)
 
 
@@ -44,7 +43,7 @@ def file(path: Path, lines: list[str], end: str = "\n") -> Path:
 
 
 def check_model(model: NvmModel) -> None:
-    """What the lines above say."""
+    """Check the values of ``MODEL``."""
     assert model.names == ("db/7.jpg", "db/8.jpg")
     assert model.focal_px.tolist() == [1000.0, 900.5]
     assert model.k_colmap.tolist() == [-0.08, 0.25]
@@ -66,18 +65,15 @@ def check_model(model: NvmModel) -> None:
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-@pytest.mark.usefixtures("small_blocks")
-def test_the_plain_form(tmp_path: Path, end: str) -> None:
+def test_a_model_is_read_with_any_line_ends_and_trailer(tmp_path: Path, end: str) -> None:
     for tail in ([], [""], ["0"], ["", "0", "", "some PLY stuff"]):
         model = read_nvm(file(tmp_path / "m.nvm", MODEL + tail, end))
         check_model(model)
-    # a file of cameras alone is a model too
     model = read_nvm(file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"], end))
     assert model.names == ("db/7.jpg",) and len(model.points) == 0
 
 
-@pytest.mark.usefixtures("small_blocks")
-def test_all_known_variants_of_the_layout(tmp_path: Path) -> None:
+def test_known_variants_of_the_layout_are_read(tmp_path: Path) -> None:
     lines = ["\ufeffNVM_V3 FixedK 1000 512 1000.5 384 ", " ", "\t", " 2  "]
     lines += ["./db/7.jpg\t1000.0 1 0 0 0  2.0 0.0 -5.0 0.08 0 ", "", TURNED.replace(" ", "\t")]
     lines += ["", "", "3 ", *(f"  {point} \n" for point in POINTS)]
@@ -90,16 +86,12 @@ def test_all_known_variants_of_the_layout(tmp_path: Path) -> None:
     assert len(poses.points) == 0 and np.array_equal(poses.centers, read_nvm(path).centers)
 
 
-def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
+def test_quaternions_are_normalised(tmp_path: Path) -> None:
     camera = "a.jpg 1 0.5003 -0.5 0.5 0.5 0 0 0 0 0"
     model = read_nvm(file(tmp_path / "m.nvm", ["1", camera, "0"]))
-    assert np.linalg.norm(model.quat_wxyz[0]) == pytest.approx(1, abs=1e-15)
     w, x, y, z = model.quat_wxyz[0]
-    assert w / x == pytest.approx(-0.5003 / 0.5, rel=1e-12)
-    assert (y, z) == (-x, -x)
-    path = file(tmp_path / "m.nvm", ["2", camera.replace("0.5003", "0.503"), CAMERA, "0"])
-    with pytest.raises(DataError, match=r"m\.nvm: camera 'a.jpg': .*not a unit quaternion"):
-        read_nvm(path)
+    assert np.linalg.norm(model.quat_wxyz[0]) == pytest.approx(1, abs=1e-15)
+    assert w / x == pytest.approx(-0.5003 / 0.5, rel=1e-12) and (y, z) == (-x, -x)
 
 
 def import_with_kapture(nvm: Path, images: Path, output: Path) -> kapture.Kapture:
@@ -147,39 +139,33 @@ def test_the_published_sample_reads_as_kapture_reads_it(shared_data: Path, tmp_p
     nvm = shared_data / SAMPLE / "3D-models" / "aachen_cvpr2018_db.nvm"
     data = import_with_kapture(nvm, shared_data / SAMPLE / "images_upright", tmp_path)
     check_against_kapture(read_nvm(nvm), data, tmp_path)
-    with pytest.raises(DataError, match="several models"):
-        read_nvm(nvm.with_name("aachen_two_parts.nvm"))
 
 
-def random_model(seed: int, num_images: int = 7, num_points: int = 60) -> NvmModel:
-    rng = np.random.default_rng(seed)
-    rotations = Rotation.random(num_images, random_state=seed).as_quat()
-    seen = rng.random((num_points, num_images)) < 0.4
-    point_ids, image_ids = np.nonzero(seen)
+def random_model(num_images: int = 7, num_points: int = 60) -> NvmModel:
+    rng = np.random.default_rng(2)
+    point_ids, image_ids = np.nonzero(rng.random((num_points, num_images)) < 0.4)
     # an image sees a point twice, and features are not dense
     point_ids, image_ids = np.r_[point_ids[:1], point_ids], np.r_[image_ids[:1], image_ids]
-    features = np.concatenate([rng.permutation(500)[: len(point_ids)]])
     points = SparsePoints(
         rng.normal(0, 1e3, (num_points, 3)),
         rng.integers(0, 256, (num_points, 3)).astype(np.uint8),
         point_ids.astype(np.int64),
         image_ids.astype(np.int32),
-        features.astype(np.int32),
-        rng.uniform(0, 1e3, (len(features), 2)).astype(np.float32),
+        rng.permutation(500)[: len(point_ids)].astype(np.int32),
+        rng.uniform(0, 1e3, (len(point_ids), 2)).astype(np.float32),
     )
     return NvmModel(
         tuple(f"db/{i}.jpg" for i in rng.permutation(num_images)),
         rng.uniform(500, 1000, num_images),
-        np.roll(rotations, 1, axis=1),
+        Rotation.random(num_images, random_state=2).as_quat(scalar_first=True),
         rng.normal(0, 1e3, (num_images, 3)),
         rng.normal(0, 0.1, num_images),
         points,
     )
 
 
-@pytest.mark.usefixtures("small_blocks")
-def test_what_is_written_comes_back_exactly_and_kapture_reads_it(tmp_path: Path) -> None:
-    model, path = random_model(2), tmp_path / "m.nvm"
+def test_a_written_model_reads_back_equal_and_kapture_reads_it(tmp_path: Path) -> None:
+    model, path = random_model(), tmp_path / "m.nvm"
     write_nvm(path, model)
     read = read_nvm(path)
     assert read.names == model.names
@@ -189,7 +175,7 @@ def test_what_is_written_comes_back_exactly_and_kapture_reads_it(tmp_path: Path)
     for name in ARRAYS:
         ours, theirs = getattr(read.points, name), getattr(model.points, name)
         assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs)
-    # COLMAP's exporter leaves blanks in blank lines, which kapture does not take for blank
+    # COLMAP's exporter leaves blanks in blank lines, which kapture does not accept
     text = path.read_text()
     assert text.startswith("NVM_V3 \n \n7  \n")
     path.write_text(text.replace("\n \n", "\n\n"))
@@ -197,24 +183,3 @@ def test_what_is_written_comes_back_exactly_and_kapture_reads_it(tmp_path: Path)
         write_image(tmp_path / "images" / name, np.zeros((48, 64, 3), np.uint8))
     data = import_with_kapture(path, tmp_path / "images", tmp_path / "kapture")
     check_against_kapture(model, data, tmp_path / "kapture")
-
-
-@pytest.mark.parametrize(
-    ("lines", "match"),
-    [
-        (["2", CAMERA, TURNED, "1", "1 2 3 4 5"], "m.nvm: not an NVM file, or broken"),
-        (["2", CAMERA, TURNED, "1", "1 2 3 4 5 6 1 2 0 1 2"], "unknown image"),
-        (["2", CAMERA, TURNED, "9", *POINTS], "the file ends before its last point"),
-        (["2", CAMERA], "1 of 2 cameras"),
-        (["2", CAMERA, CAMERA, "0"], "1 of 2 cameras, each image once"),
-        (["1", CAMERA.replace("2.0", "nan"), "0"], "not all cameras are finite"),
-        (["1", CAMERA.replace("db", ".."), "0"], "camera '../7.jpg': .*leads out"),
-        (["1", CAMERA], "not an NVM file, or broken"),
-        (["1", CAMERA, "0", "1", TURNED, "1", POINTS[2]], "several models"),
-    ],
-)
-def test_what_is_broken_is_named(tmp_path: Path, lines: list[str], match: str) -> None:
-    path = file(tmp_path / "m.nvm", lines)
-    with pytest.raises(DataError, match=match) as caught:
-        read_nvm(path)
-    assert str(caught.value).startswith(f"{path}: ")

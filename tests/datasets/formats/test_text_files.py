@@ -1,112 +1,66 @@
-"""Valid text files of every format, with other line ends, and files of other formats."""
+"""Optional parts of text files of 4Seasons and InLoc, and names of RobotCar's images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from megloc_kapture.datasets import fourseasons as fourseasons_files
-from megloc_kapture.datasets import robotcar
-from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.text_lines import read_camera_rows, read_transform
+from megloc_kapture.datasets import fourseasons, inloc, robotcar
+from megloc_kapture.values import Camera, RigidTransform
 
-TIME = 1602074877390449152
-POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
-MATRIX = "0 -1 0 5.0\n1 0 0 2.0\n0 0 1 -1e-1\n0 0 0 1\n"
-TEXTS: dict[Callable[[Path], Any], str] = {
-    fourseasons_files.read_pinhole: "Pinhole 501.5 502.5 421.8 167.7 0.0 0.0 0.0 0.0\n800 400\n"
-    "crop\n800 400\n",
-    read_transform: MATRIX,
-    fourseasons_files.read_gnss_poses: f"# header\n{TIME},{POSE},0.96,2\n{TIME + 1},{POSE},1,2,5\n",
-    fourseasons_files.read_poses: f"{TIME},{POSE}\n{TIME + 1},{POSE}\n".replace(",", " "),
-    fourseasons_files.read_relocalization: f"{TIME} 1\n{TIME} 2 {POSE.replace(',', ' ')}\n",
-    fourseasons_files.read_transformations: f"# transform_S_AS: t, q\n{POSE}\n"
-    f"# transform_w_gpsw: t\n{POSE}\n\n# transform_e_gpsw: t, q\n{POSE}\n# GNSS scale\n0.96\n",
-    robotcar.read_intrinsics: "fx 400.0\nfy 400.0\ncx 508.2\ncy 498.187378\n",
-    robotcar.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
-    robotcar.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
-    robotcar.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
-    read_camera_rows: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
-    "query/b.jpg PINHOLE 768 1024 971.838 384 512 -0.00177789",
-    read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
-    read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
-}
-
-# files of rows, of which there may be none
-EMPTY_OR_NOT = (
-    *(read_wrong_scans, fourseasons_files.read_gnss_poses, fourseasons_files.read_poses),
-    fourseasons_files.read_relocalization,
+PINHOLE = "Pinhole 501.5 502.5 421.8 167.7 0.0 0.0 0.0 0.0\n800 400\ncrop\n800 400\n"
+TRANSFORMATIONS = (
+    "# transform_S_AS: translation vector, rotation quaternion\n1,2,3,0,0,0,1\n",
+    "# TS_cam_imu: translation vector, rotation quaternion\n9,9,9,0,0,0,1\n",
+    "# transform_w_gpsw: translation vector, rotation quaternion\n4,5,6,0,0,0.6,0.8\n",
+    "# transform_e_gpsw: translation vector, rotation quaternion\n4e6,8e5,4.7e6,0.6,0,0,0.8\n",
+    "# GNSS scale\n0.9624\n",
 )
-READERS = pytest.mark.parametrize("reader", TEXTS, ids=lambda reader: reader.__name__)
 
 
-@READERS
-def test_line_ends_and_blanks_do_not_matter(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
-    text, path = TEXTS[reader].replace("\r\n", "\n"), tmp_path / "file.txt"
-    path.write_bytes(text.encode())
-    expected = repr(reader(path))
-    for other in (
-        text.replace("\n", "\r\n"),
-        text.rstrip("\n"),
-        text + "\n \r\n",
-        "\ufeff" + text,
-        "".join(f" {line}\t\n" for line in text.split("\n")),
-    ):
-        path.write_bytes(other.encode())
-        assert repr(reader(path)) == expected, other
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str], Path]:
+    def write(text: str) -> Path:
+        (tmp_path / "file.txt").write_text(text)
+        return tmp_path / "file.txt"
+
+    return write
 
 
-@pytest.mark.parametrize("separator", [",", " , "])
-def test_a_transform(tmp_path: Path, separator: str) -> None:
-    path = tmp_path / "file.txt"
-    path.write_text(MATRIX.replace(" ", separator))
-    moved = read_transform(path).apply(np.array([[1.0, 0, 0]]))
-    np.testing.assert_allclose(moved, [[5, 3, -0.1]], atol=1e-15)
+@pytest.mark.parametrize("optional", ["", " 0.0 0.0 0.0 0.0", "crop\n800 400\n"])
+def test_a_pinhole_file_has_optional_parts(write: Callable[[str], Path], optional: str) -> None:
+    camera = fourseasons.read_pinhole(write(PINHOLE.replace(optional, "") if optional else PINHOLE))
+    assert camera == Camera("PINHOLE", 800, 400, (501.5, 502.5, 421.8, 167.7))
 
 
-@READERS
-def test_empty_and_binary_files_are_named(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
-    path = tmp_path / "file.txt"
-    path.write_bytes(b"\n\r\n  \n")
-    if reader not in EMPTY_OR_NOT:
-        with pytest.raises(DataError, match=r"file\.txt\b"):
-            reader(path)
-    path.write_bytes(b"1\n2 \xff")
-    with pytest.raises(DataError, match=r"file\.txt:2: not a text file in UTF-8"):
-        reader(path)
+@pytest.mark.parametrize("order", [1, -1])
+def test_transformations_are_read_in_any_order(write: Callable[[str], Path], order: int) -> None:
+    scene_from_slam, earth_from_scene, scale = fourseasons.read_transformations(
+        write("".join(TRANSFORMATIONS[::order]))
+    )
+    world_from_scene = RigidTransform((0.8, 0.0, 0.0, 0.6), (4.0, 5.0, 6.0))
+    world_from_slam = world_from_scene @ scene_from_slam
+    np.testing.assert_allclose(world_from_slam.translation, (1.0, 2.0, 3.0), atol=1e-12)
+    np.testing.assert_allclose(world_from_slam.rotation_matrix(), np.eye(3), atol=1e-12)
+    assert earth_from_scene == RigidTransform((0.8, 0.6, 0.0, 0.0), (4e6, 8e5, 4.7e6))
+    assert scale == 0.9624
+    _, _, no_scale = fourseasons.read_transformations(write("".join(TRANSFORMATIONS[:4])))
+    assert no_scale is None
 
 
-@pytest.mark.parametrize(
-    ("reader", "old", "new", "line", "message"),
-    [
-        (read_transform, "0 0 1 -1e-1", "0 0 1", None, "expected the 16 elements"),
-        (read_transform, "-1e-1", "nan", None, "not a rotation and a translation"),
-        (read_transform, "1 0 0 2.0", "2 0 0 2.0", None, "not a rotation"),
-        (fourseasons_files.read_poses, "0 0.6", "", 1, "expected finite numbers tx ty tz"),
-        (fourseasons_files.read_poses, "0.6 0 0.8", "0 0 0", 1, "not a unit quaternion"),
-        (fourseasons_files.read_poses, f"{TIME + 1}", "1.5", 2, "invalid literal for int"),
-        (robotcar.read_intrinsics, "cy 4", "cz 4", None, "cy missing"),
-        (robotcar.read_query_location, "dawn/rear", "../a/rear", 2, "expected condition/camera"),
-        (robotcar.read_train_poses, "10.0", "x", 1, "could not convert string to float: 'x'"),
-        (read_camera_rows, "768", "wide", 2, "invalid literal for int.*'wide'"),
-        (read_camera_rows, "PINHOLE", "PIN", 2, "expected a row NAME MODEL"),
-    ],
-)
-def test_a_wrong_row_is_named(
-    tmp_path: Path,
-    reader: Callable[[Path], Any],
-    old: str,
-    new: str,
-    line: int | None,
-    message: str,
-) -> None:
-    path = tmp_path / "file.txt"
-    path.write_text(TEXTS[reader].replace("\r\n", "\n").replace(old, new))
-    with pytest.raises(DataError, match=message) as caught:
-        reader(path)
-    assert (caught.value.path, caught.value.line) == (path, line)
+def test_numbers_of_wrong_scans_are_read(write: Callable[[str], Path]) -> None:
+    path = write("known wrong:\n\n008\nDUC_scan_12.ptx 31\n2017\n")
+    assert inloc.read_wrong_scans(path) == {"008", "012", "031"}
+
+
+def test_names_of_images_have_condition_camera_and_time() -> None:
+    key = robotcar.ImageKey("night-rain", "rear", "1418840689734892")
+    for name in ("night-rain/rear/1418840689734892.png", "./night-rain/rear/1418840689734892.jpg"):
+        assert robotcar.parse_image(name) == key
+    assert (key.timestamp, key.path) == (1418840689734892, "night-rain/rear/1418840689734892")
+    assert robotcar.parse_image("rear/5.png") == robotcar.ImageKey("", "rear", "5")
+    for name in ("5.png", "a/b/rear/5.png", "../rear/5.png", "dawn/rear/5.jpeg", "dawn/rear/x.jpg"):
+        assert robotcar.parse_image(name) is None, name

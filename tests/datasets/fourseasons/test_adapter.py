@@ -1,4 +1,4 @@
-"""4Seasons' adapter: frames, selection, partial downloads, the published sample."""
+"""4Seasons: coordinate frames, selection of images, partial downloads, the published sample."""
 
 from __future__ import annotations
 
@@ -35,14 +35,8 @@ from megloc_kapture.datasets.fourseasons import Recording
 from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, LocalFrame, read_keyframe_poses
 from megloc_kapture.datasets.official import Missing, write_official
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.dataset_tables import (
-    ImageGroup,
-    read_groups,
-    read_protocol,
-    read_world,
-)
+from megloc_kapture.io import dataset_tables as tables
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.values import RigidTransform
 
 
 @pytest.fixture
@@ -50,8 +44,8 @@ def root(tmp_path: Path) -> Path:
     return write_two_recordings(tmp_path / "root")
 
 
-def test_the_worked_example(root: Path) -> None:
-    """Each row's own scale; then S_AS, the inverse of w_gpsw, and e_gpsw; by hand."""
+def test_official_poses_apply_scale_and_transformations(root: Path) -> None:
+    """Expected values by hand: scale of the row, S_AS, inverse of w_gpsw, e_gpsw."""
     dataset = read(root)
     turn = Rotation.from_euler("x", 90, degrees=True) * Rotation.from_euler("z", 90, degrees=True)
     for timestamp, center in (
@@ -70,7 +64,7 @@ def test_the_worked_example(root: Path) -> None:
     np.testing.assert_allclose(first - np.round(first), 0, atol=1e-9)
 
 
-def test_stereo_sign(root: Path) -> None:
+def test_the_right_camera_is_at_the_right(root: Path) -> None:
     """A point 0.3 m right of the left camera's axis lies on the right camera's axis."""
     dataset = read(root)
     left, right = (pose_of(dataset, image(DAY, A, c)) for c in ("cam0", "cam1"))
@@ -81,8 +75,8 @@ def test_stereo_sign(root: Path) -> None:
     np.testing.assert_allclose(colmap.img_from_cam(point), [[4.25, 1.75]], atol=1e-9)
 
 
-def test_other_recordings_have_scenes_of_their_own(root: Path) -> None:
-    """The same ECEF position through another scene and another SLAM world."""
+def test_other_recordings_have_other_transformations(root: Path) -> None:
+    """Two SLAM worlds with the same ECEF position."""
     folder = write_recording(root, RAIN, (A + 9,), (f"{A + 9} 3 0 0 0 0 0 1 2.0 2",))
     write(
         folder / "Transformations.txt",
@@ -92,52 +86,39 @@ def test_other_recordings_have_scenes_of_their_own(root: Path) -> None:
     )
     dataset = read(root, queries=RAIN)
     pose, right = (pose_of(dataset, image(RAIN, A + 9, c)) for c in ("cam0", "cam1"))
-    # (3, 0, 0) * 2 -> (5, -1, -1) -> where the first keyframe of the map is
+    # (3, 0, 0) * 2 -> (5, -1, -1) -> the position of the first keyframe of the map
     same = pose_of(dataset, image(DAY, A))
     np.testing.assert_allclose(pose.center(), same.center(), atol=1e-8)
     np.testing.assert_allclose((right @ pose.inverse()).translation, (-0.3, 0, 0), atol=1e-12)
 
 
-def test_kapture_reads_what_is_written(root: Path, tmp_path: Path) -> None:
-    before = sorted(root.rglob("*"))
+def test_kapture_reads_the_written_rig_and_integer_times(root: Path, tmp_path: Path) -> None:
     write_official(read(root), tmp_path / "out")
     theirs = kapture_from_dir(str(tmp_path / "out/mapping"))
     assert set(theirs.sensors) == set(theirs.rigs["car"]) == {"cam0", "cam1"}
     assert theirs.sensors["cam1"].sensor_params == ["PINHOLE", "8", "4", "5", "5", "4.25", "1.75"]
     np.testing.assert_allclose(theirs.rigs["car", "cam1"].t_raw, [-0.3, 0, 0])
-    assert set(theirs.trajectories) == {A, B}
-    assert set(theirs.trajectories[A]) == {"car"}
+    assert set(theirs.trajectories) == {A, B} and set(theirs.trajectories[A]) == {"car"}
     assert theirs.records_camera[A, "cam1"] == image(DAY, A, "cam1")
     queries = kapture_from_dir(str(tmp_path / "out/query"))
-    assert queries.trajectories is None
-    assert set(queries.records_camera) == {A + 5, B + 5}
-    for part in ("mapping", "query"):
-        folder = KaptureFolder(tmp_path / "out" / part)
-        assert all(folder.image_path(name).is_file() for name in folder.read().image_names())
-    assert sorted(root.rglob("*")) == before
-    # nothing says where the queries are
-    assert not (tmp_path / "out/query_gt").exists()
-    groups = read_groups(tmp_path / "out/megloc")
-    assert groups[image(SNOW, A + 5)] == ImageGroup(condition=SNOW)
-    assert not groups[image(SNOW, A + 5, "cam1")].scored
-    assert groups[image(DAY, A)].location == DAY
-    protocol = read_protocol(tmp_path / "out/megloc")
+    assert queries.trajectories is None and set(queries.records_camera) == {A + 5, B + 5}
+
+
+def test_tables_have_the_groups_protocol_and_world_of_the_challenge(root: Path) -> None:
+    dataset = read(root)
+    assert dataset.query_gt is None  # the poses of the queries are unknown
+    assert dataset.groups[image(SNOW, A + 5)] == tables.ImageGroup(condition=SNOW)
+    assert not dataset.groups[image(SNOW, A + 5, "cam1")].scored
+    assert dataset.groups[image(DAY, A)].location == DAY
+    protocol = dataset.protocol
     assert (protocol.dataset, protocol.conditions) == ("4seasons", (SNOW,))
     assert protocol.thresholds == ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
     assert protocol.pose_file == "ltvl"
-    quaternion = read_world(tmp_path / "out/megloc").official_from_local.quat_wxyz
+    quaternion = dataset.world.official_from_local.quat_wxyz
     np.testing.assert_allclose(quaternion, [np.sqrt(0.5), np.sqrt(0.5), 0, 0])
 
 
-def test_left_images_alone(root: Path) -> None:
-    dataset = read(root, stereo=False)
-    assert dataset.mapping.image_names() == [image(DAY, A), image(DAY, B)]
-    assert dataset.mapping.rigs == {"car": {"cam0": RigidTransform.identity()}}
-    assert len(dataset.mapping.poses()) == 2
-    assert dataset.query.image_names() == [image(SNOW, A + 5), image(SNOW, B + 5)]
-
-
-def test_keyframes_or_all_frames(root: Path) -> None:
+def test_all_frames_are_imported_on_request(root: Path) -> None:
     for camera in ("cam0", "cam1"):
         write(root / image(DAY, B + 100, camera), "x")
     write(root / DAY / "undistorted_images/cam0/preview.png", "x")
@@ -148,13 +129,13 @@ def test_keyframes_or_all_frames(root: Path) -> None:
     assert len(dataset.mapping.poses()) == 4
 
 
-def test_recordings_by_name(root: Path) -> None:
+def test_map_and_queries_are_recordings_by_name(root: Path) -> None:
     write_recording(root, RAIN, (A + 9,), (f"{A + 9},0,0,0,0,0,0,1,1,2",))
-    # the first with poses is the map, all others are queries
+    # by default the first recording with poses is the map, all others are queries
     assert {name.split("/")[0] for name in read(root).query.image_names()} == {SNOW, RAIN}
     dataset = read(root, reference=RAIN, queries=[SNOW, DAY])
     assert {name.split("/")[0] for name in dataset.mapping.image_names()} == {RAIN}
-    assert dataset.query_gt is not None  # the day's poses are published
+    assert dataset.query_gt is not None  # the poses of the day are published
     assert len(dataset.query_gt.poses()) == 4
     assert len(read(root, reference=f"{RAIN}, {DAY}").mapping.poses()) == 6
     with pytest.raises(OptionError, match=f"option queries: no recording 'x' in .*; .* {DAY}"):
@@ -165,7 +146,7 @@ def test_recordings_by_name(root: Path) -> None:
         read(root, reference=SNOW)
 
 
-def test_poor_fusion_is_dropped(root: Path) -> None:
+def test_keyframes_of_poor_fusion_are_skipped(root: Path) -> None:
     rows = (ROWS[0], ROWS[1].replace(",2,0.5", ",0,0.5"))
     write(root / DAY / "GNSSPoses.txt", "\n".join(rows))
     dataset = read(root)
@@ -177,7 +158,7 @@ def test_poor_fusion_is_dropped(root: Path) -> None:
         read(root)
 
 
-def test_a_pose_without_scale_takes_the_recordings(root: Path) -> None:
+def test_a_pose_without_scale_uses_the_scale_of_the_recording(root: Path) -> None:
     write(root / DAY / "GNSSPoses.txt", f"{A},8,0,0,0,0,0,1\n{B},2,4,0,0,0,0,1,0.25,2")
     center = official(read(root), image(DAY, A)).center()
     np.testing.assert_allclose(center, (3999990.0, 800030.0, 4699981.0), atol=1e-8)
@@ -189,8 +170,7 @@ def test_a_pose_without_scale_takes_the_recordings(root: Path) -> None:
         read(root)
 
 
-def test_calibrations_differ(root: Path) -> None:
-    """Recordings may bring their own calibration, under a capital letter."""
+def test_recordings_may_have_their_calibration(root: Path) -> None:
     write_calibration(root / SNOW / "Calibration", baseline=-0.31)
     dataset = read(root)
     assert set(dataset.mapping.rigs) == {"car"}
@@ -203,38 +183,116 @@ def test_calibrations_differ(root: Path) -> None:
         FourSeasons().check(root)
 
 
-def test_what_is_no_dataset(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such folder"):
-        FourSeasons().check(tmp_path / "absent")
-    with pytest.raises(DataError, match="no recording here"):
-        FourSeasons().check(tmp_path)
-    write_calibration(tmp_path / "calibration")
-    write_recording(tmp_path, DAY, (A, B))
-    FourSeasons().check(tmp_path)
-    with pytest.raises(DataError, match="<another recording, for the queries>"):
-        write_official(read(tmp_path), tmp_path / "out")
-    write_official(read(tmp_path), tmp_path / "out", allow_missing=True)
-    assert len(KaptureFolder(tmp_path / "out/mapping").read().poses()) == 4
+# ------------------------------------------------------------------ relocalization challenges
 
 
-def test_a_partial_download_is_refused_or_asked_for(root: Path, tmp_path: Path) -> None:
-    for camera in ("cam0", "cam1"):
-        (root / image(DAY, B, camera)).unlink()
-    shutil.rmtree(root / SNOW / "undistorted_images/cam1")
+def many_keyframes(root: Path, count: int) -> list[int]:
+    times = [A + 50_000_000 * k for k in range(count)]
+    write_recording(root, DAY, times, [f"{t},{k},0,0,0,0,0,1,1,2" for k, t in enumerate(times)])
+    return times
+
+
+@pytest.mark.parametrize(
+    ("day", "snow", "name"),
+    [
+        (DAY, SNOW, f"relocalizationFile_{DAY}_to_{SNOW}.txt"),
+        ("loop_2_train", "loop_2_test", "reloc_loop_2_train_to_loop_2_test.txt"),
+        (DAY, SNOW, f"{DAY}/RelocalizationFilesTest/relocalizationFile_{SNOW}_hard.txt"),
+    ],
+)
+def test_relocalization_files_select_images_and_priors(
+    root: Path, tmp_path: Path, day: str, snow: str, name: str
+) -> None:
+    times = many_keyframes(root, 50)
+    if day != DAY:
+        (root / DAY).rename(root / day)
+        (root / SNOW).rename(root / snow)
+    write_recording(root, "a_drive_elsewhere", (5,), (f"5,{','.join(ROWS[0].split(',')[1:])}",))
+    write(root / name, f"{times[25]} {B + 5}\n{times[3]} {B + 5}\n")
     dataset = read(root)
-    with pytest.raises(DataError, match=f"4 files are missing: {DAY}/.*{B}.png, .*allow-missing"):
-        write_official(dataset, tmp_path / "out")
-    write_official(dataset, tmp_path / "out", allow_missing=True)
-    assert len(KaptureFolder(tmp_path / "out/mapping").read().poses()) == 2
-    query = KaptureFolder(tmp_path / "out/query").read()
-    assert query.image_names() == [image(SNOW, A + 5), image(SNOW, B + 5)]
-    shutil.rmtree(root / SNOW / "undistorted_images")
-    assert root / SNOW / "undistorted_images/cam0" in missing_of(read(root))
+    write_official(dataset, tmp_path / "out")
+    written = tmp_path / "out/megloc"
+    pose_file = Path(name).name
+    assert tables.read_relocalization(written) == [
+        tables.RelocalizationPair(pose_file, image(day, times[25]), image(snow, B + 5)),
+        tables.RelocalizationPair(pose_file, image(day, times[3]), image(snow, B + 5)),
+    ]
+    # only images of the pairs, in the recordings of the file's name
+    assert times_of(dataset.query) == {B + 5}
+    assert {n.split("/")[0] for n in dataset.mapping.image_names()} == {day}
+    # 20 keyframes around each reference: 5 to 45, and 0 to 23
+    near = sorted(image(day, t, c) for t in times[:46] for c in ("cam0", "cam1"))
+    assert tables.read_priors(written) == {
+        image(snow, B + 5, "cam0"): tuple(near),
+        image(snow, B + 5, "cam1"): tuple(near),
+    }
+    groups = tables.read_groups(written)
+    assert groups[image(snow, B + 5)].scored
+    assert not groups[image(snow, B + 5, "cam1")].scored
+    protocol = tables.read_protocol(written)
+    assert protocol.pose_file == "mlad"
+    assert protocol.thresholds == ((0.1, None), (0.2, None), (0.5, None))
+    assert dataset.query_gt is None
+    assert not dataset.remarks
+
+
+def test_with_all_frames_only_those_of_the_pairs_are_scored(root: Path) -> None:
+    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
+    dataset = read(root, frames="all")
+    assert times_of(dataset.query) == {A + 5, B + 5}
+    scored = [name for name in dataset.query.image_names() if dataset.groups[name].scored]
+    assert scored == [image(SNOW, B + 5)]
+
+
+def test_pairs_of_2020_have_poses_relative_to_poses_txt(root: Path) -> None:
+    (root / DAY / "GNSSPoses.txt").unlink()
+    (root / DAY / "Transformations.txt").unlink()
+    write(root / DAY / "poses.txt", f"# ts t q\n{A} 100.5 7 3 0 0 0 1\n{B} 101.5 7 3 0 0 0.6 0.8\n")
+    folder = root / DAY / "RelocalizationFilesVal"
+    write(folder / f"relocalizationFile_{SNOW}.txt", f"{A} {B + 5} 1 2 3 0 0 0.6 0.8\n")
+    dataset = read(root)
+    center = official(dataset, image(DAY, A)).center()
+    np.testing.assert_allclose(center, [100.5, 7, 3], atol=1e-12)
+    known = official(dataset, image(SNOW, B + 5))
+    turn = Rotation.from_quat([0, 0, 0.6, 0.8]).as_matrix()
+    np.testing.assert_allclose(known.rotation_matrix(), turn, atol=1e-12)
+    # x_query = R (x_world - (100.5, 7, 3)) + (1, 2, 3)
+    at = np.array([[101.0, 8.0, 5.0]])
+    np.testing.assert_allclose(known.apply(at)[0], turn @ [0.5, 1, 2] + [1, 2, 3], atol=1e-12)
+    assert "poses.txt, in a separate frame" in dataset.remarks[0]
+
+
+def test_the_pose_of_a_pair_takes_precedence_over_that_of_the_recording(root: Path) -> None:
+    write_recording(root, RAIN, (A + 9,), (f"{A + 9},0,0,0,0,0,0,1,1,2",))
+    write(root / f"reloc_{DAY}_to_{RAIN}.txt", f"{A} {A + 9} 0 0 0 0 0 0 1\n")
+    dataset = read(root)
+    assert pose_of(dataset, image(RAIN, A + 9)) == pose_of(dataset, image(DAY, A))
+
+
+def test_pairs_of_unknown_images_are_skipped(root: Path) -> None:
+    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n77 {B + 5}\n{A} 78\n")
+    dataset = read(root)
+    assert [pair.query for pair in dataset.relocalization] == [image(SNOW, A + 5)]
+    assert "2 pairs of relocalization files are left out" in dataset.remarks[0]
+    assert missing_of(dataset) == [root / image(SNOW, 78, c) for c in ("cam0", "cam1")]
+
+
+def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
+    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n")
+    write(root / f"reloc_{DAY}_to_garage.txt", f"{A} 1\n")
+    assert missing_of(read(root)) == [root / "garage"]
+    assert not missing_of(read(root, queries=SNOW))
+    write(root / "relocalizationFile_garage.txt", f"{A} 1\n")
+    with pytest.raises(DataError, match="does not say whose map it means"):
+        read(root)
+
+
+# ------------------------------------------------------------------ the published sample
 
 
 @pytest.fixture
 def sample(shared_data: Path, tmp_path: Path) -> Path:
-    """The published recording, four of its images, as map and again as queries."""
+    """The published sample of a recording, as map and as queries."""
     source = shared_data / "kapture_samples/4seasons/TUM"
     root = tmp_path / "sample"
     root.mkdir()
@@ -245,7 +303,7 @@ def sample(shared_data: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_all_poses_of_the_sample_as_kaptures_importer_has_them(sample: Path) -> None:
+def test_all_poses_of_the_published_sample_equal_those_of_kapture(sample: Path) -> None:
     folder = sample / "a_map"
     poses = read_keyframe_poses(
         Recording("a_map", folder), min_fusion_quality=1, on_earth=False, missing=Missing(sample)
@@ -261,13 +319,13 @@ def test_all_poses_of_the_sample_as_kaptures_importer_has_them(sample: Path) -> 
         assert np.linalg.norm(pose.center()) < 1000
         official, car = frame.world().pose_in_official(pose), theirs[timestamp, "car"]
         np.testing.assert_allclose(official.center(), car.inverse().t_raw, atol=1e-7)
-        # theirs are left at the length that six decimals give them
+        # quaternions of kapture are not normalised
         dot = np.dot(official.quat_wxyz, car.r_raw) / np.linalg.norm(car.r_raw)
         assert abs(dot) == pytest.approx(1, abs=1e-14)
 
 
 @pytest.mark.slow
-def test_the_sample_as_kapture(sample: Path, tmp_path: Path) -> None:
+def test_kapture_reads_the_samples_cameras_and_rigs_equally(sample: Path, tmp_path: Path) -> None:
     dataset = read(sample)
     with pytest.raises(DataError, match="11480 files are missing"):
         write_official(dataset, tmp_path / "out")
@@ -279,9 +337,9 @@ def test_the_sample_as_kapture(sample: Path, tmp_path: Path) -> None:
         ours = mapping.sensors[camera].camera()
         values = list(map(float, sensors[camera].camera_params))
         assert [ours.width, ours.height, *ours.params] == values
-        own, theirs = mapping.rigs["car"][camera], rigs["car", camera]
-        np.testing.assert_allclose(own.translation, theirs.t_raw, atol=1e-12)
-        np.testing.assert_allclose(np.abs(own.quat_wxyz), np.abs(theirs.r_raw), atol=1e-9)
-    # the queries are the same images, through another folder
+        rig_pose, theirs = mapping.rigs["car"][camera], rigs["car", camera]
+        np.testing.assert_allclose(rig_pose.translation, theirs.t_raw, atol=1e-12)
+        np.testing.assert_allclose(np.abs(rig_pose.quat_wxyz), np.abs(theirs.r_raw), atol=1e-9)
+    # the queries are the same images in another folder
     truth = KaptureFolder(tmp_path / "out/query_gt").read()
     assert truth.trajectories == mapping.trajectories

@@ -1,4 +1,4 @@
-"""RobotCar Seasons in kapture folders that kapture's own importer made of its official layout."""
+"""RobotCar Seasons in kapture folders, made by kapture's importer of the official layout."""
 
 from __future__ import annotations
 
@@ -46,25 +46,25 @@ def read(root: Path, **options: object) -> OfficialDataset:
 @pytest.mark.parametrize(
     "options", [{}, {"train_as_map": True}, {"queries": "train"}, {"location_prior": False}]
 )
-def test_the_same_dataset_in_both_forms(
+def test_both_forms_give_the_same_dataset(
     official: Path, root: Path, tmp_path: Path, options: dict[str, object]
 ) -> None:
     shutil.copyfile(official / TEST_LIST, root / TEST_LIST)
-    found, expected = read(root, **options), read(official, model="individual", **options)
+    actual, expected = read(root, **options), read(official, model="individual", **options)
     assert len(expected.names) == len(TEST) * (options.get("queries") != "train")
-    assert_same_dataset(found, expected, atol=1e-12)
-    for data, other in ((found.mapping, expected.mapping), (found.query, expected.query)):
+    assert_same_dataset(actual, expected, atol=1e-12)
+    for data, other in ((actual.mapping, expected.mapping), (actual.query, expected.query)):
         (ours,), (theirs,) = data.rigs.values(), other.rigs.values()
         assert ours.keys() == theirs.keys()
         for camera, pose in theirs.items():
             np.testing.assert_allclose(ours[camera].matrix(), pose.matrix(), rtol=0, atol=1e-12)
-    assert_linked(found, tmp_path / "out", official / "images")
+    assert_linked(actual, tmp_path / "out", official / "images")
     name, priors = f"dawn/rear/{ts(12)}.jpg", read_priors(tmp_path / "out/megloc")
     assert priors.get(name, ("002/rear",)) == ("002/rear",)
     assert bool(priors) == options.get("location_prior", True)
 
 
-def test_without_the_list_all_that_may_be_asked_for_is_handed_in(downloaded: Path) -> None:
+def test_without_the_test_list_all_unpublished_rear_images_are_submitted(downloaded: Path) -> None:
     dataset = read(downloaded)
     hidden = sorted(
         (place, ts(number)) for number, (_, place) in QUERIES.items() if number not in TRAIN
@@ -74,8 +74,7 @@ def test_without_the_list_all_that_may_be_asked_for_is_handed_in(downloaded: Pat
     assert dataset.query_gt is not None and len(dataset.query_gt.poses()) == len(TRAIN)
 
 
-def test_version_1(official: Path, root: Path) -> None:
-    # every rear image is asked for; which poses are public does not depend on it
+def test_version_1_is_read_without_training_images(official: Path, root: Path) -> None:
     expected = read(official, version=1, model="individual")
     assert_same_dataset(read(root, version=1), expected, atol=1e-12)
     for part in root.glob("*/mapping"):
@@ -86,7 +85,7 @@ def test_version_1(official: Path, root: Path) -> None:
         read(root, train_as_map=True)
 
 
-def test_it_is_found_by_the_folder_kapture_unpacks_to(
+def test_the_folder_of_kapture_s_archive_is_recognised(
     downloaded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MEGLOC_DATA", str(downloaded.parent))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +13,15 @@ from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
-    KaptureData,
     KaptureFolder,
     MatchesWriter,
     Observations,
-    Sensor,
     write_observations,
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
+from tests.worlds import one_camera
 
 FLOAT = np.dtype("float32")
 IMAGES = ("a.jpg", "b/c.jpg")
@@ -29,16 +29,11 @@ IMAGES = ("a.jpg", "b/c.jpg")
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A whole small kapture: 2 images with 5 keypoints each, 3 points."""
+    """A complete small kapture: 2 images with 5 keypoints each, 3 points."""
     root = tmp_path / "map"
-    data = KaptureData(
-        sensors={"cam": Sensor.from_camera(Camera("SIMPLE_PINHOLE", 8, 6, (9, 4, 3)))}
-    )
-    for time, image in enumerate(IMAGES):
-        data.records_camera[time, "cam"] = image
-        data.trajectories[time, "cam"] = RigidTransform.identity()
+    write_sensors(root, one_camera(IMAGES, RigidTransform.identity()))
+    for image in IMAGES:
         write_image(root / "sensors/records_data" / image, np.full((6, 8, 3), 100, np.uint8))
-    write_sensors(root, data)
     with (
         FeatureWriter(root, "keypoints", "T", FeatureConfig("k", FLOAT, 2)) as keypoints,
         FeatureWriter(root, "descriptors", "T", FeatureConfig("d", FLOAT, 4, "T")) as descriptors,
@@ -61,12 +56,7 @@ def write_points(root: Path, *extra: tuple[int, int, int]) -> None:
     write_observations(root, {"T": Observations("T", IMAGES, points, images, keypoints)})
 
 
-def refuse(root: Path, match: str, *, deep: bool = False) -> None:
-    with pytest.raises(DataError, match=match):
-        KaptureFolder(root).validate(deep=deep)
-
-
-def test_a_whole_kapture_is_valid(root: Path) -> None:
+def test_a_complete_kapture_is_valid_and_its_parts_are_listed(root: Path) -> None:
     folder = KaptureFolder(root)
     folder.validate()
     folder.validate(deep=True)
@@ -80,40 +70,46 @@ def test_a_whole_kapture_is_valid(root: Path) -> None:
     assert folder.points3d().shape == (3, 6)
     assert len(folder.observations()["T"]) == 2
     assert not KaptureFolder(root / "sensors").has_points()
+
+
+def test_arrays_that_readers_share_are_read_only(root: Path) -> None:
+    folder = KaptureFolder(root)
     shared = folder.observations()["T"]
     for array in (folder.points3d(), shared.point_ids, shared.keypoint_ids):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
 
 
-def test_names_lead_nowhere_else_and_absent_types_are_named_with_those_that_are_there(
-    root: Path,
-) -> None:
+def test_an_unknown_type_is_refused_with_the_known_types(root: Path) -> None:
     folder = KaptureFolder(root)
     reads = (folder.keypoints, folder.descriptors, folder.global_features, folder.matches)
     for read, present in zip(reads, "TTGT", strict=True):
         for name in ("X", "..", "T/../T", ""):
             with pytest.raises(DataError, match=f"there are: {present}"):
                 read(name)
+
+
+def test_paths_of_images_and_depth_maps_stay_inside_the_folder(root: Path) -> None:
+    folder = KaptureFolder(root)
     for path_of in (folder.image_path, folder.depth_path):
         for name in ("../../sensors.txt", "/etc/passwd", "a/../b", ""):
             with pytest.raises(DataError):
                 path_of(name)
 
 
-def test_features_beside_the_kapture_are_added(root: Path, tmp_path: Path) -> None:
-    beside = tmp_path / "beside"
+def test_features_of_additional_folders_are_added(root: Path, tmp_path: Path) -> None:
+    additional = tmp_path / "additional"
     with FeatureWriter(
-        beside, "keypoints", "T", FeatureConfig("k", FLOAT, 2), orphan=True
+        additional, "keypoints", "T", FeatureConfig("k", FLOAT, 2), orphan=True
     ) as writer:
         writer.write("query.jpg", np.zeros((1, 2)))
         writer.write("a.jpg", np.zeros((9, 2)))
-    with MatchesWriter(beside, "U", orphan=True) as matches:
+    with MatchesWriter(additional, "U", orphan=True) as matches:
         matches.write("a.jpg", "query.jpg", np.array([[0, 0]]), np.ones(1))
-    folder = KaptureFolder(root, features_dirs=[beside, tmp_path / "not_there_yet"])
+    folder = KaptureFolder(root, features_dirs=[additional, tmp_path / "absent"])
     keypoints = folder.keypoints("T")
     assert keypoints.names == ["a.jpg", "b/c.jpg", "query.jpg"]
-    assert keypoints.length("a.jpg") == 5  # the kapture's own come first
+    assert keypoints.length("a.jpg") == 5  # those in the kapture take precedence
     assert folder.types("matches") == ["T", "U"]
     assert len(folder.matches("U").read("query.jpg", "a.jpg")[0]) == 1
 
@@ -136,50 +132,55 @@ def test_parts_and_the_root_may_be_links(root: Path, tmp_path: Path) -> None:
     ("name", "share", "match"),
     [
         ("descriptors/T/a.jpg.desc", 0.8, r"a\.jpg\.desc: 4 descriptors for 5 keypoints"),
-        ("descriptors/T/a.jpg.desc", 0.9, r"a\.jpg\.desc: .*truncated"),
         ("keypoints/T/a.jpg.kpt", 0.9, r"a\.jpg\.kpt: .*truncated"),
-        ("global_features/G/a.jpg.gfeat", 0.9, r"a\.jpg\.gfeat: .*truncated"),
         ("keypoints/T/a.jpg.kpt", None, r"'a\.jpg' has descriptors but no keypoints of type 'T'"),
         ("points3d.txt", None, r"points3d\.txt: cannot read: the file is missing"),
     ],
 )
-def test_files_that_are_cut_or_gone(root: Path, name: str, share: float | None, match: str) -> None:
+def test_truncated_and_missing_files_are_named(
+    root: Path, name: str, share: float | None, match: str
+) -> None:
     path = root / "reconstruction" / name
     content = path.read_bytes()
     path.unlink()
     if share is not None:
         path.write_bytes(content[: int(share * len(content))])
-    refuse(root, match)
+    with pytest.raises(DataError, match=match):
+        KaptureFolder(root).validate()
 
 
-def test_observations_past_points_and_keypoints_are_named(root: Path) -> None:
-    write_points(root, (1, 1, 5))
-    refuse(
-        root, r"observations\.txt: point 1, keypoint 5 of 'b/c\.jpg': .* 5 keypoints of type 'T'"
-    )
-    write_points(root, (3, 0, 0))
-    refuse(root, r"observations\.txt: point 3, keypoint 0 of 'a\.jpg': there are 3 points")
-    with pytest.raises(DataError, match="point 3"):
-        KaptureFolder(root).observations()
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        ((1, 1, 5), r"point 1, keypoint 5 of 'b/c\.jpg': .* 5 keypoints of type 'T'"),
+        ((3, 0, 0), r"point 3, keypoint 0 of 'a\.jpg': there are 3 points"),
+    ],
+)
+def test_observations_of_unknown_keypoints_and_points_are_named(
+    root: Path, observation: tuple[int, int, int], message: str
+) -> None:
+    write_points(root, observation)
+    with pytest.raises(DataError, match=rf"observations\.txt: {message}"):
+        KaptureFolder(root).validate()
 
 
-def test_observations_of_images_taken_out_of_the_map_are_left_alone(root: Path) -> None:
+def test_observations_of_removed_images_are_ignored(root: Path) -> None:
     write_points(root, (1, 1, 4))
     for path in (root / "reconstruction").rglob("c.jpg.*"):
         path.unlink()
     KaptureFolder(root).validate()
 
 
-@pytest.mark.slow
-def test_real_folders_are_read_and_valid(shared_data: Path) -> None:
-    roots = sorted(p.parent for p in shared_data.glob("scenes/*/*/sensors"))
-    roots += sorted(p.parent for p in shared_data.glob("foreign_maps/*/*/sensors"))
-    roots += sorted(p.parent for p in shared_data.glob("kapture_samples/*/kapture/*/sensors"))
-    assert len(roots) >= 18
-    for root in roots:
-        folder = KaptureFolder(root)
-        folder.validate()
-        data = folder.read()
-        assert len(data.image_names()) > 0
-        with_poses = root.name in ("mapping", "mapping_rig", "map", "query_gt", "training")
-        assert len(data.poses()) == (len(data.image_names()) if with_poses else 0)
+def test_features_shared_by_two_images_of_one_name_are_refused(root: Path, tmp_path: Path) -> None:
+    features = root / "reconstruction"
+    for name in ("keypoints", "descriptors"):
+        shutil.copytree(features / name / "T", tmp_path / "shared/local_features/T" / name)
+    query = tmp_path / "query"
+    shutil.copytree(root / "sensors", query / "sensors")
+    shared = [KaptureFolder(place, features_dirs=[tmp_path / "shared"]) for place in (root, query)]
+    shared[0].check_features_apart(shared[1])
+    write_image(query / "sensors/records_data/a.jpg", np.full((6, 8, 3), 50, np.uint8))
+    with pytest.raises(
+        DataError, match=r"a\.jpg\.kpt: a\.jpg is another image in .*--features-dir"
+    ):
+        shared[0].check_features_apart(shared[1])

@@ -6,12 +6,18 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 
-class Runs:
-    """Pickled as a call; unpickled by pickle itself it makes a folder."""
 
+class _MakesFolder:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
         return os.mkdir, (str(self.folder),)
+
+
+@pytest.fixture
+def code(tmp_path: Path) -> object:
+    """Object that creates the folder ``made`` where pickle itself loads it."""
+    return _MakesFolder(tmp_path / "made")

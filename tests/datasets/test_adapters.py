@@ -1,0 +1,103 @@
+"""Downloads of official datasets that lack folders or files, the same way for every dataset."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from aachen_files import write_v1_0, write_v1_1
+from fourseasons_files import DAY, SNOW, B, image, write_two_recordings
+from inloc_files import write_download
+from robotcar_files import ts, write_layout
+
+from megloc_kapture.datasets.official import write_official
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import DATASETS
+
+CUTOUTS = "database/cutouts"
+
+
+@pytest.fixture(scope="module")
+def layouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small official layouts, in a folder per dataset; read only."""
+    root = tmp_path_factory.mktemp("layouts")
+    write_v1_1(write_v1_0(root / "aachen"))
+    write_layout(root / "robotcar")
+    write_two_recordings(root / "4seasons")
+    write_download(root / "inloc")
+    return root
+
+
+def without(layouts: Path, dataset: str, tmp_path: Path, *gone: str) -> Path:
+    """Return a copy of a layout without some files or folders."""
+    root = tmp_path / dataset
+    shutil.copytree(layouts / dataset, root)
+    for path in (root / name for name in gone):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return root
+
+
+@pytest.mark.parametrize(
+    ("dataset", "gone", "message"),
+    [
+        ("aachen", ["images_upright", "queries", "3D-models"], "no folder images_upright and quer"),
+        ("aachen", ["queries"], "no folder queries; the root must contain images_upright"),
+        ("robotcar", ["images", "3D-models"], "not RobotCar Seasons, no folder images and 3D"),
+        ("4seasons", [DAY, SNOW], "no recording here"),
+        ("inloc", [f"{CUTOUTS}/DUC1", f"{CUTOUTS}/DUC2"], "none of DUC1, DUC2 exists"),
+        ("inloc", ["query"], "query/iphone7/ is missing; InLoc lies as database"),
+        ("inloc", ["database/alignments"], "database/alignments/ is missing; InLoc lies as"),
+    ],
+)
+def test_a_folder_without_the_layout_is_refused(
+    layouts: Path, tmp_path: Path, dataset: str, gone: list[str], message: str
+) -> None:
+    adapter: Any = load_plugin(DATASETS, dataset, {})
+    adapter.check(layouts / dataset)
+    root = without(layouts, dataset, tmp_path, *gone)
+    with pytest.raises(DataError, match=f"{root}.*{message}"):
+        adapter.check(root)
+    with pytest.raises(DataError, match="absent"):
+        adapter.check(tmp_path / "absent")
+
+
+@pytest.mark.parametrize(
+    ("dataset", "gone", "message", "map_images", "queries"),
+    [
+        ("aachen", "images_upright/db/7.jpg", r"db/7\.jpg", 4, 5),
+        ("robotcar", "robotcar_v2_train.txt", "robotcar_v2_train.txt", 9, 12),
+        ("robotcar", "intrinsics/left_intrinsics.txt", "left_intrinsics.txt", 6, 8),
+        ("robotcar", "images/night", f"images/night/left/{ts(13)}.jpg", 9, 9),
+        ("robotcar", f"images/overcast-reference/rear/{ts(2)}.jpg", f"rear/{ts(2)}.jpg", 8, 12),
+        ("4seasons", SNOW, "<another recording, for the queries>", 4, 0),
+        ("4seasons", image(DAY, B), f"{DAY}/.*{B}.png", 3, 4),
+        ("4seasons", f"{SNOW}/undistorted_images/cam1", f"{SNOW}/.*cam1", 4, 2),
+        ("inloc", f"{CUTOUTS}/DUC1/024/DUC_cutout_024_30_0.jpg", "DUC_cutout_024_30_0.jpg", 71, 3),
+        ("inloc", f"{CUTOUTS}/DUC1/024/DUC_cutout_024_0_0.jpg.mat", "0_0.jpg.mat", 72, 3),
+        ("inloc", f"{CUTOUTS}/DUC2", f"{CUTOUTS}/DUC2", 36, 3),
+        ("inloc", "database/alignments/DUC2/transformations/DUC_trans_024.txt", "trans", 36, 3),
+    ],
+)
+def test_missing_files_are_refused_or_skipped_on_request(
+    layouts: Path,
+    tmp_path: Path,
+    dataset: str,
+    gone: str,
+    message: str,
+    map_images: int,
+    queries: int,
+) -> None:
+    adapter: Any = load_plugin(DATASETS, dataset, {})
+    root = without(layouts, dataset, tmp_path, gone)
+    with pytest.raises(DataError, match=f"{root}.*{message}.*--allow-missing"):
+        write_official(adapter.read(root), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    write_official(adapter.read(root, allow_missing=True), tmp_path / "out", allow_missing=True)
+    mapping, query = (KaptureFolder(tmp_path / "out" / part) for part in ("mapping", "query"))
+    mapping.validate(deep=True)
+    assert len(mapping.read().records_camera) == map_images
+    assert len(query.read().records_camera) == queries

@@ -1,0 +1,239 @@
+"""Mistakes in files: each is refused with the name of the file and, in tables, the line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.csv_table import read_csv_table
+from megloc_kapture.io.dataset_tables import read_groups, read_names, read_relocalization
+from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb
+from megloc_kapture.io.kapture.features import (
+    SUFFIX,
+    ArrayKind,
+    FeatureConfig,
+    FeatureReader,
+    FeatureWriter,
+    TarBlobs,
+    feature_folder,
+    list_types,
+    read_config,
+)
+from megloc_kapture.io.kapture.matches import read_pairs
+from megloc_kapture.io.kapture.points import read_observations, read_points3d
+from megloc_kapture.io.kapture.sensors import read_kapture_data
+
+VERSION = "# kapture format: 1.1\n"
+SENSORS = VERSION + (
+    "cam, , camera, PINHOLE, 640, 480, 500, 500, 320, 240\n"
+    "deep, , depth, SIMPLE_PINHOLE, 320, 240, 250, 160, 120\n"
+)
+IDENTITY = "1, 0, 0, 0, 0, 0, 0"
+
+# the correct rows before the mistake, and the reader
+TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    "sensors/sensors.txt": (SENSORS, read_kapture_data),
+    "sensors/records_camera.txt": (VERSION + "0, cam, ok.jpg\n# note\n", read_kapture_data),
+    "sensors/trajectories.txt": (VERSION + f"0, cam, {IDENTITY}\n", read_kapture_data),
+    "sensors/rigs.txt": (VERSION + f"rig, cam, {IDENTITY}\n", read_kapture_data),
+    "keypoints.txt": (VERSION, lambda root: read_config(root / "keypoints.txt", "keypoints")),
+    "descriptors.txt": (VERSION, lambda root: read_config(root / "descriptors.txt", "descriptors")),
+    "pairs.txt": (VERSION + "a, b, 1\n", lambda root: read_pairs(root / "pairs.txt")),
+    "table.csv": (
+        "image,reason\nok,\n",
+        lambda root: list(read_csv_table(root / "table.csv", ("image", "reason"))),
+    ),
+    "groups.csv": ("image,condition,frame,location,scored\n", read_groups),
+    "names.csv": ("image,name\n", read_names),
+    "relocalization.csv": ("file,reference,query\n", read_relocalization),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "message"),
+    [
+        ("sensors/records_camera.txt", "1, cam", "expected 3 columns, got 2"),
+        ("sensors/records_camera.txt", "1.5, cam, a.jpg", "invalid literal for int.* '1.5'"),
+        ("sensors/records_camera.txt", "9, nocam, a.jpg", "unknown sensor or rig 'nocam'"),
+        ("sensors/records_camera.txt", "9, deep, a.jpg", "of type 'depth', not 'camera'"),
+        ("sensors/records_camera.txt", "0, cam, b.jpg", "timestamp 0 of 'cam' is listed twice"),
+        ("sensors/records_camera.txt", "9, cam, ok.jpg", "'ok.jpg' is listed twice"),
+        ("sensors/records_camera.txt", "9, cam, a/../../b.jpg", "leads out"),
+        ("sensors/trajectories.txt", "1, cam, 1, 0, 0, 0, 0, 0", "expected 9 columns, got 8"),
+        ("sensors/trajectories.txt", "1, cam, nan, 0, 0, 0, 0, 0, 0", "finite numbers qw"),
+        ("sensors/trajectories.txt", "1, cam, 0.998, 0, 0, 0, 0, 0, 0", "not a unit quaternion"),
+        ("sensors/trajectories.txt", "1, cam, 1, 0, 0, , 0, 0, 0", "some but not all"),
+        ("sensors/trajectories.txt", f"0, rig, {IDENTITY}", "unknown sensor or rig 'rig'"),
+        ("sensors/sensors.txt", "x, ", "at least 3 columns"),
+        ("sensors/sensors.txt", "cam, n, gnss", "'cam' is empty or listed twice"),
+        ("sensors/sensors.txt", "x, n, camera", "expected a camera model, width, height"),
+        ("sensors/sensors.txt", "x, n, camera, PINHOLLOW, 6, 4, 1, 1, 1, 1", "unknown camera mod"),
+        ("sensors/sensors.txt", "x, n, camera, PINHOLE, 6, 4, 5, 3, 2", "takes 4 parameters"),
+        ("sensors/sensors.txt", "x, n, camera, PINHOLE, 6, 4, nan, 5, 3, 2", "must be finite"),
+        ("sensors/sensors.txt", "x, n, camera, UNKNOWN_CAMERA, 640", "width and a height"),
+        ("sensors/rigs.txt", f"deep, cam, {IDENTITY}", "also a sensor id"),
+        ("sensors/rigs.txt", f"rig, cam, {IDENTITY}", "twice"),
+        ("keypoints.txt", "n, float32", "expected 3 columns, got 2"),
+        ("keypoints.txt", "n, float16, 2", "dtype 'float16' is not one of"),
+        ("keypoints.txt", "n, float32, 0", "dsize '0'"),
+        ("descriptors.txt", "n, float32, 2, ../k, L2", "leads out"),
+        ("pairs.txt", "a, b", "expected 3 columns, got 2"),
+        ("pairs.txt", "a, b, c", "expected finite numbers score, got 'c'"),
+        ("pairs.txt", "a, ../b, 1", "leads out"),
+        ("pairs.txt", ", b, 1", "empty"),
+        ("table.csv", "c", "1 fields"),
+        ("table.csv", "a,b,c", "3 fields"),
+        ("groups.csv", "a.jpg,day,,,x", "scored: it should be a valid boolean"),
+        ("groups.csv", "../a.jpg,day,,,1", "leads out"),
+        ("names.csv", "a.jpg,x y", "name: "),
+        ("relocalization.csv", "../../x.txt,a,b", ""),
+    ],
+)
+def test_a_wrong_row_is_named_with_file_and_line(
+    tmp_path: Path, name: str, row: str, message: str
+) -> None:
+    before, read = TABLES[name]
+    (tmp_path / "sensors").mkdir()
+    (tmp_path / "sensors/sensors.txt").write_text(SENSORS)
+    content = f"{before}{row}\n"
+    (tmp_path / name).write_text(content)
+    line = len(content.splitlines())
+    with pytest.raises(DataError, match=f"{re.escape(name)}:{line}: .*{message}"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ("# kapture format: 1.2\n", "1.2 is not supported"),
+        ("# kapture format: 11.1\n", "11.1 is not supported"),
+        ("", "first line must be"),
+    ],
+)
+def test_a_newer_or_missing_version_is_refused(tmp_path: Path, head: str, message: str) -> None:
+    (tmp_path / "sensors").mkdir()
+    (tmp_path / "sensors/sensors.txt").write_text(SENSORS.replace(VERSION, head))
+    with pytest.raises(DataError, match=rf"sensors\.txt:1: .*{message}"):
+        read_kapture_data(tmp_path)
+
+
+def test_the_layout_of_kapture_1_0_names_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "reconstruction/keypoints").mkdir(parents=True)
+    (tmp_path / "reconstruction/keypoints/keypoints.txt").write_text(VERSION)
+    with pytest.raises(DataError, match="kapture_upgrade_1_0_to_1_1"):
+        list_types(tmp_path, "keypoints", orphan=False)
+
+
+@pytest.mark.parametrize("content", [b"", b"image\na\n", b"image,reason,extra\na,b,c\n"])
+def test_a_csv_table_with_another_header_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"table\.csv:1: .*header"):
+        list(read_csv_table(path, ("image", "reason")))
+
+
+def test_a_csv_table_in_another_encoding_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes(b"image,reason\na,\xff\n")
+    with pytest.raises(DataError, match=r"table\.csv:2: .*UTF-8"):
+        list(read_csv_table(path, ("image", "reason")))
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("1,2,3,4,5", "not a table of 3 or 6 columns"),
+        ("1,2,3,4,5,", "could not convert string ''"),
+        ("1,2,3,4,5,nan", "point 20 is not finite"),
+    ],
+)
+def test_wrong_points_are_named(tmp_path: Path, row: str, message: str) -> None:
+    path = tmp_path / "points3d.txt"
+    path.write_text(VERSION + "1,2,3,4,5,6\n" * 20 + row + "\n1,2,3,4,5,6\n")
+    with pytest.raises(DataError, match=rf"points3d\.txt:.*{message}"):
+        read_points3d(path)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("5, t, a", "expected point3d_id"),
+        ("5, t, a, 1, b", "expected point3d_id"),
+        ("x, t, a, 1", "expected point3d_id"),
+        ("5, t, a, -1", "ids from 0 on"),
+        (f"5, t, a, {2**31}", "ids from 0 on"),
+        ("5, t/u, a, 1", "cannot be a type name"),
+        ("5, t, ../a, 1", "leads out"),
+    ],
+)
+def test_wrong_observations_name_the_file(tmp_path: Path, row: str, message: str) -> None:
+    path = tmp_path / "observations.txt"
+    path.write_text(VERSION + "0, t, a, 1, b, 2\n" * 20 + row + "\n3, t, a, 1\n")
+    with pytest.raises(DataError, match=message) as caught:
+        read_observations(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "config", "size", "message"),
+    [
+        ("keypoints", FeatureConfig("k", np.dtype("float32"), 3), 23, "whole rows"),
+        ("global_features", FeatureConfig("g", np.dtype("float32"), 16), 0, "exactly one row"),
+        ("global_features", FeatureConfig("g", np.dtype("float32"), 16), 128, "exactly one row"),
+    ],
+)
+def test_truncated_arrays_are_named(
+    tmp_path: Path, kind: ArrayKind, config: FeatureConfig, size: int, message: str
+) -> None:
+    with FeatureWriter(tmp_path, kind, "T", config) as writer:
+        writer.put(f"a.jpg{SUFFIX[kind]}", bytes(size))
+    features = FeatureReader(kind, "T", [feature_folder(tmp_path, kind, "T", orphan=False)])
+    for read in (features.read, features.length):
+        with pytest.raises(DataError, match=rf"a\.jpg\.\w+: {size} bytes are not {message}"):
+            read("a.jpg")
+
+
+def test_a_compressed_tar_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "keypoints.tar"
+    path.write_bytes(b"\x1f\x8b\x08packed")
+    with pytest.raises(DataError, match=r"keypoints\.tar: not an uncompressed tar"):
+        TarBlobs(path, ".kpt")
+
+
+def test_a_depth_map_of_another_size_or_a_missing_one_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.depth").write_bytes(bytes(24))
+    for width, height in ((3, 3), (3, 1)):
+        with pytest.raises(DataError, match=r"a\.depth: 24 bytes"):
+            read_depth_map(tmp_path / "a.depth", width=width, height=height)
+    with pytest.raises(DataError, match=r"b\.depth: cannot read: the file is missing"):
+        read_depth_map(tmp_path / "b.depth", width=3, height=2)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
+def test_truncated_images_are_named(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / ("a" + suffix)
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(path)
+    content = path.read_bytes()
+    for share in (0.5, 0.99):
+        path.write_bytes(content[: int(len(content) * share)])
+        with pytest.raises(DataError, match=path.name):
+            read_image_rgb(path)
+
+
+def test_files_other_than_images_are_named(tmp_path: Path) -> None:
+    (tmp_path / "text.jpg").write_text("not an image")
+    (tmp_path / "empty.jpg").touch()
+    (tmp_path / "folder.jpg").mkdir()
+    (tmp_path / "dangling.jpg").symlink_to("/nowhere")
+    for name in ("text.jpg", "empty.jpg", "folder.jpg", "dangling.jpg", "missing.jpg"):
+        for read in (read_image_rgb, image_size):
+            with pytest.raises(DataError, match=name):
+                read(tmp_path / name)
