@@ -1,4 +1,4 @@
-"""The index in files: equal to the one in memory, in this process and in others."""
+"""The map index: built from a map, written to files and opened by other processes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def empty_index() -> MapIndex:
 @pytest.mark.parametrize(
     "index", [make_index(), make_index(covariances=True), empty_index()], ids=str
 )
-def test_what_is_written_is_what_is_opened(index: MapIndex, tmp_path: Path) -> None:
+def test_a_written_index_is_opened_without_reading_it(index: MapIndex, tmp_path: Path) -> None:
     write_index(index, tmp_path / "index")
     opened = open_index(tmp_path / "index")
     assert opened.row_of_image == index.row_of_image
@@ -51,13 +51,13 @@ def test_what_is_written_is_what_is_opened(index: MapIndex, tmp_path: Path) -> N
         assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape)
         np.testing.assert_array_equal(mine, theirs)
         assert not mine.flags.writeable
-        assert len(mine) == 0 or isinstance(mine.base, np.memmap)  # not read
+        assert len(mine) == 0 or isinstance(mine.base, np.memmap)
     assert (opened.covariances is None) == (index.covariances is None)
     if index.covariances is not None:
         np.testing.assert_array_equal(opened.covariances, index.covariances)
 
 
-def test_the_files_of_a_shared_index_go_away() -> None:
+def test_files_of_a_shared_index_are_removed() -> None:
     index = make_index()
     with shared_index({"sift": index, "other": empty_index()}) as folders:
         assert list(folders) == ["sift", "other"]
@@ -82,9 +82,7 @@ def test_the_index_is_of_one_keypoints_type(world: Any) -> None:
         index_map(world.map(), "other")
 
 
-def test_a_type_that_nothing_was_triangulated_of_has_an_index_without_points(
-    world: Any, tmp_path: Path
-) -> None:
+def test_a_map_without_points_has_an_empty_index(world: Any, tmp_path: Path) -> None:
     whole = world.map()
     root = Path(shutil.copytree(whole.root, tmp_path / "map", symlinks=True))
     write_points3d(root, np.zeros((0, 6)))
@@ -92,30 +90,23 @@ def test_a_type_that_nothing_was_triangulated_of_has_an_index_without_points(
     empty = KaptureFolder(root, features_dirs=whole.features_dirs)
     index = index_map(empty, "rootsift")
     assert index.xyz.shape == (0, 3) and not index.row_of_image
-    image = whole.read().image_names()[0]
-    assert [len(part) for part in index.observed(image)] == [0, 0]
-    with shared_index({"rootsift": index}) as folders:
-        assert open_index(folders["rootsift"]).xyz.shape == (0, 3)
 
 
-def test_the_covariances_of_the_map_are_taken(world: Any, tmp_path: Path) -> None:
+def test_covariances_of_the_map_are_read(world: Any, tmp_path: Path) -> None:
     folder = KaptureFolder(shutil.copytree(world.map().root, tmp_path / "map"))
     count = len(folder.points3d())
     known = np.arange(6.0 * count).reshape(count, 6)
     write_point_covariances(folder.root, known)
     index = index_map(folder, "rootsift")
     np.testing.assert_array_equal(index.covariances, known)
-    write_point_covariances(folder.root, known[1:])
-    with pytest.raises(DataError, match="one row per point"):
-        index_map(folder, "rootsift")
 
 
-def test_the_noise_of_the_map_is_that_of_points_which_several_images_observe(world: Any) -> None:
-    """A point that was lifted from its keypoint fits it, which says nothing."""
+def test_noise_is_measured_by_points_with_several_observations(world: Any) -> None:
     folder = world.map()
     measured = with_noise(folder, index_map(folder, "rootsift"))
     assert 0.02 < measured.noise_px < 1
     assert measured.noise_rad == pytest.approx(measured.noise_px / 300, rel=0.5)
+    # lifted points have one observation, without error
     once = np.unique(measured.point_ids, return_index=True)[1]
     images = np.repeat(np.arange(len(measured.row_of_image)), np.diff(measured.offsets))[once]
     lifted = MapIndex.build(

@@ -1,4 +1,4 @@
-"""The map as a stage writes it: right, complete, and readable by kapture itself."""
+"""Triangulated maps: accurate, complete and read by kapture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
     ImagePair,
-    KaptureData,
     KaptureFolder,
     MatchesWriter,
     write_sensors,
@@ -39,20 +38,13 @@ def arrays(folder: KaptureFolder, kind: str) -> dict[str, Any]:
     return {image: reader.read(image) for image in reader.names}
 
 
-def bare(source: KaptureFolder, root: Path, data: KaptureData | None = None) -> Path:
-    """A kapture with the images of another, without features."""
-    write_sensors(root, data or source.read())
-    link_images(source.root, root)
-    return root
-
-
-def test_observations_are_of_these_points(world: Any) -> None:
+def test_observed_points_project_to_their_keypoints(world: Any) -> None:
     folder = world.map()
     data = folder.read()
     xyz = folder.points3d()[:, :3]
     observations = folder.observations()["rootsift"]
     assert observations.image_names == tuple(sorted(world.map_poses))
-    # COLMAP makes points of three images at least, and may take one of them out again
+    # COLMAP makes points of at least three images and may remove one observation
     lengths = np.bincount(observations.point_ids, minlength=len(xyz))
     assert lengths.min() >= 2 and (lengths >= 3).mean() > 0.95
     for image_id, image in enumerate(observations.image_names):
@@ -65,19 +57,18 @@ def test_observations_are_of_these_points(world: Any) -> None:
         assert errors.max() < 4.5 and np.median(errors) < 0.5
 
 
-def test_the_map_stands_alone(world: Any) -> None:
-    """Everything that localizing needs is in it: images, features, vocabulary, no other folder."""
+def test_the_map_contains_everything_for_localization(world: Any) -> None:
     folder = KaptureFolder(world.root / "map")
     folder.validate(deep=True)
     assert folder.read().poses().keys() == world.map_poses.keys()
     ours, given = folder.read(), world.mapping().read()
     assert ours.sensors == given.sensors and ours.trajectories == given.trajectories
     for kind in KINDS:
-        own, everything = arrays(folder, kind), arrays(world.mapping(), kind)
-        assert own.keys() == world.map_poses.keys()  # and nothing of the queries
-        for image, array in own.items():
-            np.testing.assert_array_equal(array, everything[image])
-    # nothing is written twice
+        features, extracted = arrays(folder, kind), arrays(world.mapping(), kind)
+        assert features.keys() == world.map_poses.keys()  # without the queries
+        for image, array in features.items():
+            np.testing.assert_array_equal(array, extracted[image])
+    # features and images are links
     file = "keypoints/left/0.png.kpt"
     linked = folder.root / "reconstruction" / file.replace("/", "/rootsift/", 1)
     assert linked.samefile(world.features_dir / "local_features" / "rootsift" / file)
@@ -107,7 +98,7 @@ def test_kapture_reads_the_map(world: Any) -> None:
         np.testing.assert_allclose(pose.t_raw, expected_pose.translation, atol=1e-12)
 
 
-def test_only_the_pairs_asked_for_are_used(world: Any, tmp_path: Path) -> None:
+def test_only_given_pairs_are_triangulated(world: Any, tmp_path: Path) -> None:
     pairs = [
         ImagePair("right/2.png", "left/0.png", 1.0),
         ImagePair("left/0.png", "left/1.png", 1.0),
@@ -125,7 +116,7 @@ def test_only_the_pairs_asked_for_are_used(world: Any, tmp_path: Path) -> None:
     }
 
 
-def test_what_cannot_be_triangulated_is_refused(world: Any, tmp_path: Path) -> None:
+def test_missing_poses_and_matches_are_refused(world: Any, tmp_path: Path) -> None:
     matches, options = world.with_matches("mapping"), TriangulationOptions()
     with pytest.raises(DataError, match="no mapping image has a pose"):
         triangulate_map(world.query(), matches, "rootsift", tmp_path, options)
@@ -134,41 +125,24 @@ def test_what_cannot_be_triangulated_is_refused(world: Any, tmp_path: Path) -> N
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("tar", [False, True])
-def test_features_of_the_mapping_itself_are_copied_too(
-    world: Any, write_features: Any, tmp_path: Path, tar: bool
+def test_features_inside_the_mapping_folder_come_first(
+    world: Any, write_features: Any, tmp_path: Path
 ) -> None:
-    """A mapping that brings its own features has them in ``reconstruction/``, perhaps as tar.
-
-    They come before those beside it: observations index what was triangulated.
-    """
-    whole = bare(world.mapping(), tmp_path / "whole")
-    own = {kind: arrays(KaptureFolder(world.root / "map"), kind) for kind in KINDS}
-    for kind in KINDS:
-        write_features(whole, kind, "rootsift", own[kind], orphan=False, tar=tar)
-    matches, options = world.with_matches("mapping"), TriangulationOptions()
-    counts = triangulate_map(KaptureFolder(whole), matches, "rootsift", tmp_path / "map", options)
-    assert counts["points"] == len(world.map().points3d())
-    found = KaptureFolder(tmp_path / "map")
-    found.validate(deep=True)
-    for kind in KINDS:
-        copied = arrays(found, kind)
-        assert copied.keys() == own[kind].keys()
-        for image, array in copied.items():
-            np.testing.assert_array_equal(array, own[kind][image])
-    assert found.types("global_features") == []
-    # one image of its own, the others beside it
-    own_px, image = own["keypoints"]["right/2.png"][::-1].copy(), "right/2.png"
-    some = bare(world.mapping(), tmp_path / "some")
-    write_features(some, "keypoints", "rootsift", {image: own_px}, orphan=False, tar=tar)
-    both = KaptureFolder(some, features_dirs=[world.features_dir])
-    triangulate_map(both, matches, "rootsift", tmp_path / "map of both", options)
-    stored = arrays(KaptureFolder(tmp_path / "map of both"), "keypoints")
-    np.testing.assert_array_equal(stored[image], own_px)
-    np.testing.assert_array_equal(stored["left/0.png"], own["keypoints"]["left/0.png"])
+    root, image = tmp_path / "mapping", "right/2.png"
+    write_sensors(root, world.mapping().read())
+    link_images(world.mapping().root, root)
+    extracted = arrays(world.mapping(), "keypoints")
+    inside = {image: extracted[image][::-1].copy()}
+    write_features(root, "keypoints", "rootsift", inside, orphan=False, tar=True)
+    mapping = KaptureFolder(root, features_dirs=[world.features_dir])
+    options = TriangulationOptions()
+    triangulate_map(mapping, world.with_matches("mapping"), "rootsift", tmp_path / "map", options)
+    stored = arrays(KaptureFolder(tmp_path / "map"), "keypoints")
+    np.testing.assert_array_equal(stored[image], inside[image])
+    np.testing.assert_array_equal(stored["left/0.png"], extracted["left/0.png"])
 
 
-def test_each_of_several_types_has_points_of_its_own(
+def test_each_local_type_has_its_points(
     world: Any, write_features: Any, tmp_path: Path, folder_bytes: Any
 ) -> None:
     features = tmp_path / "features"
@@ -191,31 +165,26 @@ def test_each_of_several_types_has_points_of_its_own(
     options = TriangulationOptions()
     counts = triangulate_map(mapping, matches, ["rootsift", "half", "half"], both, options)
     half = triangulate_map(mapping, matches, "half", alone, options)
-    found, own = KaptureFolder(both), KaptureFolder(alone)
+    found, single = KaptureFolder(both), KaptureFolder(alone)
     found.validate(deep=True)
-    num_first, num_second = len(world.map().points3d()), len(own.points3d())
+    num_first, num_second = len(world.map().points3d()), len(single.points3d())
     assert num_second > 30
     np.testing.assert_array_equal(
-        found.points3d(), np.concatenate([world.map().points3d(), own.points3d()])
+        found.points3d(), np.concatenate([world.map().points3d(), single.points3d()])
     )
     assert observed(found, "rootsift") == observed(world.map(), "rootsift")
-    assert observed(found, "half", num_first) == observed(own, "half")
+    assert observed(found, "half", num_first) == observed(single, "half")
     assert found.types("keypoints") == found.types("descriptors") == ["half", "rootsift"]
     assert counts["points_rootsift"] == num_first and counts["points_half"] == num_second
     assert counts["points"] == num_first + num_second
-    assert counts["observations"] == counts["observations_rootsift"] + half["observations"]
-    assert counts["observations_half"] == half["observations"]
-    assert counts["pairs"] == 20 and "points_half" not in half
-    theirs = kapture.io.csv.kapture_from_dir(str(both))
-    types = {key[1] for key in theirs.observations.key_pairs()}
-    assert types == {"rootsift", "half"}
+    assert counts["observations_half"] == half["observations"] and counts["pairs"] == 20
     again = tmp_path / "again"
     triangulate_map(mapping, matches, ["rootsift", "half"], again, options, num_threads=3)
     assert folder_bytes(both) == folder_bytes(again)
 
 
 def observed(folder: KaptureFolder, name: str, offset: int = 0) -> list[Any]:
-    """Images, points, images' rows and keypoints of a type's observations."""
+    """Return the image names, points, image rows and keypoints of a type."""
     seen = folder.observations()[name]
     columns = seen.point_ids - offset, seen.image_ids, seen.keypoint_ids
     return [seen.image_names, *(column.tolist() for column in columns)]
