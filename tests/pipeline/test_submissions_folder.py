@@ -1,4 +1,4 @@
-"""Pose files of several runs in one folder: none is overwritten, the same is not kept twice."""
+"""Pose files of several runs in one folder: none is overwritten and none is kept twice."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import write_provenance
 from megloc_kapture.pipeline.submission import keep_submission
+from tests.worlds import folder_bytes
 
 NAME = "Aachen_v1_1_eval_megloc-classic"
 
@@ -31,17 +32,7 @@ def pose_files(run: Path, texts: dict[str, str]) -> Path:
     return place
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
-def test_other_poses_of_the_name_stand_beside_the_old_ones_and_the_same_are_found(
-    tmp_path: Path,
-) -> None:
+def test_different_pose_files_get_numbers_and_equal_ones_are_reused(tmp_path: Path) -> None:
     folder, texts = tmp_path / "kept", ("first\n", "second\n", "third\n")
     places = [pose_file(tmp_path / text.strip(), text, preset=text) for text in texts]
     names = [f"{NAME}.txt", f"{NAME}-2.txt", f"{NAME}-3.txt"]
@@ -51,15 +42,15 @@ def test_other_poses_of_the_name_stand_beside_the_old_ones_and_the_same_are_foun
         places[0].with_name(f"{NAME}.txt.json").read_bytes()
     )
     for place, text in zip(kept, texts, strict=True):
-        told = json.loads(place.with_name(f"{place.name}.json").read_text())
+        provenance = json.loads(place.with_name(f"{place.name}.json").read_text())
         assert place.read_text() == text
-        assert list(told["files"]) == [place.name] and told["preset"] == text
-    before = contents(folder)
-    # whatever name they have; their provenance is that of the run that made them first
+        assert list(provenance["files"]) == [place.name] and provenance["preset"] == text
+    before = folder_bytes(folder)
+    # the provenance of the first run stays
     again = pose_file(tmp_path / "again", "second\n", preset="another")
     for place, expected in zip([*reversed(places), again], [*kept[::-1], kept[1]], strict=True):
         assert keep_submission(place, folder) == expected
-    assert contents(folder) == before
+    assert folder_bytes(folder) == before
 
 
 def test_a_challenge_of_several_files_is_a_folder(tmp_path: Path) -> None:
@@ -67,18 +58,16 @@ def test_a_challenge_of_several_files_is_a_folder(tmp_path: Path) -> None:
     first = pose_files(tmp_path / "1", {"a.txt": "1 2\n", "b.txt": "3 4\n"})
     other = pose_files(tmp_path / "2", {"a.txt": "1 2\n", "b.txt": "5 6\n"})
     fewer = pose_files(tmp_path / "3", {"a.txt": "1 2\n"})
-    # fewer files are another result, not the beginning of this one
     names = [keep_submission(place, folder).name for place in (fewer, first, other, first)]
     assert names == [f"4Seasons_eval_megloc-1.5{end}" for end in ("", "-2", "-3", "-2")]
     for place, name in zip((fewer, first, other), names, strict=False):
-        assert contents(folder / name) == contents(place)
+        assert folder_bytes(folder / name) == folder_bytes(place)
         assert (folder / f"{name}.json").read_bytes() == Path(f"{place}.json").read_bytes()
 
 
-@pytest.mark.parametrize("gone", [f"{NAME}.txt", f"{NAME}.txt.json"])
-def test_a_lost_pose_file_is_said_to_be_lost(tmp_path: Path, gone: str) -> None:
+def test_a_missing_pose_file_is_refused(tmp_path: Path) -> None:
     place = pose_file(tmp_path / "run", "a\n")
-    (place.parent / gone).unlink()
+    place.unlink()
     with pytest.raises(DataError, match="--from submission"):
         keep_submission(place, tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
