@@ -1,4 +1,4 @@
-"""A stopped run goes on inside its long stages; changed code of a plugin runs its stage again."""
+"""Stopped runs continue inside long stages; changed plugins run again."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
 from megloc_kapture.pipeline.plan import StageReport, Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.stages.work import Work
+from tests.worlds import folder_bytes
 
 PLUGINS = '''
 import cv2
@@ -71,7 +72,7 @@ OPTIONS = ("local_features=corners", "global_features=thumbnail", "matching=near
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The package of the plugins, as pip leaves it."""
+    """The installed package of the plugins."""
     site = tmp_path / "site"
     info = site / "patches-1.2.dist-info"
     info.mkdir(parents=True)
@@ -89,13 +90,12 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def forget_modules() -> None:
-    """As in a new process."""
     for name in [name for name in sys.modules if name.partition(".")[0] == "patches"]:
         del sys.modules[name]
 
 
 class Stopped(BaseException):
-    """As a signal ends a run."""
+    """A signal that ends a run."""
 
 
 @dataclass
@@ -106,8 +106,8 @@ class Runs:
     root: Path
     options: tuple[str, ...] = OPTIONS
     last: str = "query_matches"
-    told: dict[str, tuple[int, str]] = field(default_factory=dict)
-    """Items that were done and their label, by the stage's first word."""
+    progress: dict[str, tuple[int, str]] = field(default_factory=dict)
+    """Number of items and label, by the first word of the label."""
 
     def run(
         self,
@@ -116,11 +116,11 @@ class Runs:
         executor: Executor | None = None,
         **how: Any,
     ) -> dict[str, StageReport]:
-        self.told.clear()
+        self.progress.clear()
         forget_modules()
 
         def track(items: Iterable[Any], total: int, label: str) -> Iterator[Any]:
-            self.told[re.split("[ ,]", label)[0]] = total, label
+            self.progress[re.split("[ ,]", label)[0]] = total, label
             for number, item in enumerate(items):
                 if stop_at == (re.split("[ ,]", label)[0], number):
                     raise Stopped
@@ -143,19 +143,18 @@ class Runs:
         return left
 
     def check_undisturbed(self) -> None:
-        """Compare what there is with what a run from nothing writes of the scene as it is now."""
-        fresh = replace(self, root=self.root.with_name("undisturbed"), told={})
+        """Compare the outputs with those of a new run without interruptions."""
+        fresh = replace(self, root=self.root.with_name("undisturbed"), progress={})
         shutil.rmtree(fresh.root, ignore_errors=True)
         fresh.run()
         assert contents(self.root) == contents(fresh.root)
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """All that stages wrote, by path."""
-    files = (path for path in sorted(root.rglob("*")) if path.is_file() and not path.is_symlink())
-    named = {path.relative_to(root).as_posix(): path for path in files}
+    """Return the outputs of stages, by path."""
     hidden = ("stages/", "megloc/", "timing", ".")
-    return {name: path.read_bytes() for name, path in named.items() if not name.startswith(hidden)}
+    files = folder_bytes(root).items()
+    return {name: content for name, content in files if not name.startswith(hidden)}
 
 
 @pytest.fixture
@@ -164,11 +163,10 @@ def runs(package: Path, scene: Path, tmp_path: Path) -> Runs:
     return Runs(copy, tmp_path / "run")
 
 
-def test_a_stopped_run_goes_on_inside_the_stage(runs: Runs) -> None:
+def test_a_stopped_run_continues_inside_the_stage(runs: Runs) -> None:
     runs.stopped("corners", 4)
-    # and it may be stopped again
     runs.stopped("corners", 3)
-    assert runs.told["corners"] == (7, "corners features, 4 kept")
+    assert runs.progress["corners"] == (7, "corners features, 4 kept")
     left = runs.stopped("thumbnail", 5)
     assert left.name == "global_features"
     runs.stopped("matching", 2)
@@ -178,7 +176,7 @@ def test_a_stopped_run_goes_on_inside_the_stage(runs: Runs) -> None:
     runs.check_undisturbed()
 
 
-def test_changed_code_of_a_plugin_makes_its_stage_run_again(runs: Runs, package: Path) -> None:
+def test_a_changed_plugin_runs_again(runs: Runs, package: Path) -> None:
     before = runs.run()
     assert before["local_features"].why == "not done yet"
     with open(package / "plugins.py", "a") as file:
@@ -187,11 +185,11 @@ def test_changed_code_of_a_plugin_makes_its_stage_run_again(runs: Runs, package:
     assert reports["local_features"].why == "code of patches.plugins.Corners changed"
     assert reports["global_features"].why == "code of patches.plugins.Thumbnail changed"
     assert reports["mapping_matches"].why == "local_features changed"
-    # another module of its package, and what it writes
+    # another module of the package
     (package / "shift.py").write_text("SHIFT = 1\n")
     assert runs.run(last="local_features")["local_features"].why.startswith("code of patches")
     assert "code of" in runs.run(dry_run=True)["global_features"].why
-    # and a new release
+    # a new release
     runs.run(last="local_features")
     metadata = package.parent / "patches-1.2.dist-info" / "METADATA"
     metadata.write_text(metadata.read_text().replace("1.2", "1.3"))
