@@ -18,7 +18,7 @@ from megloc_kapture.pipeline.datasets import (
     find_benchmark,
     twin_of,
 )
-from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation, recall_rows
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.plan import Manifest, StageReport, Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -64,11 +64,6 @@ def run_twin(
     few = ["local_features.options.max_keypoints=1500", "global_features.options.num_clusters=32"]
     options = options_of_preset(changes=[benchmark.options], assignments=[*few, *changes])
     return run_in(workspace, source, options, workers=2, benchmark=benchmark)
-
-
-def recall(workspace: Workspace, name: str = "all") -> list[float]:
-    """Return the recall at each threshold."""
-    return [at["recall"] for at in recall_rows(workspace.root)[name]["recall"]]
 
 
 def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, float]:

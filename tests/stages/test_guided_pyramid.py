@@ -9,7 +9,6 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
-import corner
 import cv2
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from kapture.io.features import image_keypoints_from_file
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.images import read_image_rgb, write_image
@@ -28,7 +26,6 @@ from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.guided_pyramid import (
-    PyramidFeatures,
     PyramidMethod,
     pyramid_mapping,
     pyramid_queries,
@@ -37,7 +34,6 @@ from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
-from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Pose, RigidTransform
 
 MAP_IMAGES = ("left/1.png", "right/2.png", "right/3.png")
@@ -113,19 +109,19 @@ class Scene:
         mapping: KaptureFolder | None = None,
         query: KaptureFolder | None = None,
         pairs: list[ImagePair] | None = None,
-        work: Work = HERE,
         num_found: dict[tuple[str, str], int] | None = None,
         **more: Any,
     ) -> dict[str, float]:
         mapping, pairs = mapping or self.mapping(), pairs or self.pairs(name)
-        more_arguments: Any = {"num_found": num_found, "work": work}
         with single_threaded():
             if name == "mapping":
                 how = method(**{"verification": KnownPoseOptions()} | more)
-                return pyramid_mapping(mapping, pairs, "upright", how, output, **more_arguments)
+                return pyramid_mapping(mapping, pairs, "upright", how, output, num_found=num_found)
             query = query or self.folder(name)
             how = method(**more)
-            return pyramid_queries(query, mapping, pairs, "upright", how, output, **more_arguments)
+            return pyramid_queries(
+                query, mapping, pairs, "upright", how, output, num_found=num_found
+            )
 
 
 def method(**more: Any) -> PyramidMethod:
@@ -200,9 +196,12 @@ def test_rotated_queries_gain_matches_and_are_localized(scene: Scene, tmp_path: 
     mapping = scene.larger("mapping")
     with single_threaded():
         how, made = TriangulationOptions(), tmp_path / "map"
-        triangulate_map(mapping, mapping, "upright-pyramid", made, how)
+        with pytest.raises(DataError, match="no point could be triangulated"):
+            triangulate_map(scene.mapping(), scene.mapping(), "upright", tmp_path / "base", how)
+        counts = triangulate_map(mapping, mapping, "upright-pyramid", made, how)
         off = scene.retry("turned", tmp_path / "off", options=GuidedPyramidOptions())
         more = scene.retry("turned", tmp_path / "max", options=MAX)
+    assert counts["observations"] > 100 and counts["mean_reprojection_error_px"] < 1.0
     assert off["pairs_tried"] == off["images_extracted_again"] == 0
     assert more["pairs_gained"] == 4
     found = {}
@@ -210,38 +209,6 @@ def test_rotated_queries_gain_matches_and_are_localized(scene: Scene, tmp_path: 
         query = KaptureFolder(scene.root / "turned", features_dirs=[folder])
         found[folder.name] = recall(KaptureFolder(tmp_path / "map"), query)
     assert found["turned_all"] == found["max"] == 1.0 > found["off"]
-
-
-def test_added_matches_see_the_same_points(scene: Scene) -> None:
-    query = scene.larger("turned")
-    other = "right/2.png"
-    camera, pose = scene.mapping().read().camera_of(other), scene.mapping().read().poses()[other]
-    for image in query.read().image_names():
-        rows, _ = query.matches("upright-pyramid").read(image, other)
-        px = query.keypoints("upright-pyramid").read(image)[rows[:, 0]]
-        other_px = scene.mapping().keypoints("upright").read(other)[rows[:, 1]]
-        column, line = other_px.T.astype(int)
-        in_cam = bearing_rays(camera, other_px)
-        in_cam *= (corner.depth_m(pose)[line, column] / in_cam[:, 2])[:, None]
-        points = pose.inverse().apply(in_cam)
-        seen = project(query.read().camera_of(image), query.read().poses()[image], points)
-        distance = np.linalg.norm(seen - px, axis=1)
-        assert np.median(distance) < 1.0
-        assert (distance < 6.0).mean() > 0.85  # a two-view model constrains matches to lines only
-
-
-def test_retried_mapping_pairs_give_points(scene: Scene, tmp_path: Path) -> None:
-    larger = scene.larger("mapping")
-    with single_threaded():
-        with pytest.raises(DataError, match="no point could be triangulated"):
-            triangulate_map(
-                scene.mapping(), scene.mapping(), "upright", tmp_path / "a", TriangulationOptions()
-            )
-        after = triangulate_map(
-            larger, larger, "upright-pyramid", tmp_path / "b", TriangulationOptions()
-        )
-    assert after["observations"] > 100
-    assert after["mean_reprojection_error_px"] < 1.0
 
 
 def test_queries_are_matched_with_keypoints_added_to_the_map(scene: Scene, tmp_path: Path) -> None:
@@ -285,23 +252,21 @@ def test_features_of_the_base_type_keep_their_rows(scene: Scene, kind: str) -> N
         np.testing.assert_array_equal(more_scores[: len(indices)], scores)
 
 
-def test_kapture_reads_the_pyramid_type(scene: Scene) -> None:
-    place = scene.root / "as_kapture"
-    shutil.copytree(scene.root / "mapping" / "sensors", place / "sensors")
+def test_kapture_reads_the_pyramid_type(scene: Scene, tmp_path: Path) -> None:
+    name = "upright-pyramid"
+    shutil.copytree(scene.root / "mapping" / "sensors", tmp_path / "sensors")
     for kind in ("keypoints", "descriptors", "matches"):
-        shutil.copytree(
-            scene.root / "mapping_all" / "local_features" / "upright-pyramid" / kind,
-            place / "reconstruction" / kind / "upright-pyramid",
-        )
-    read = kapture_from_dir(str(place))
-    assert set(read.keypoints["upright-pyramid"]) == set(MAP_IMAGES)
-    assert read.descriptors["upright-pyramid"].keypoints_type == "upright-pyramid"
-    expected, stored = KaptureFolder(place).keypoints("upright-pyramid"), read.keypoints
+        source = scene.root / "mapping_all" / "local_features" / name / kind
+        shutil.copytree(source, tmp_path / "reconstruction" / kind / name)
+    theirs = kapture_from_dir(str(tmp_path))
+    keypoints = theirs.keypoints[name]
+    assert set(keypoints) == set(MAP_IMAGES)
+    assert theirs.descriptors[name].keypoints_type == name
+    assert set(theirs.matches[name]) == set(combinations(MAP_IMAGES, 2))
     for image in MAP_IMAGES:
-        file = str(place / "reconstruction/keypoints/upright-pyramid" / f"{image}.kpt")
-        like = stored["upright-pyramid"].dtype, stored["upright-pyramid"].dsize
-        np.testing.assert_array_equal(image_keypoints_from_file(file, *like), expected.read(image))
-    assert set(read.matches["upright-pyramid"]) == set(combinations(MAP_IMAGES, 2))
+        file = str(tmp_path / "reconstruction" / "keypoints" / name / f"{image}.kpt")
+        read = image_keypoints_from_file(file, keypoints.dtype, keypoints.dsize)
+        np.testing.assert_array_equal(read, scene.larger("mapping").keypoints(name).read(image))
 
 
 def test_masks_apply_to_variants_and_small_variants_are_skipped(
@@ -372,39 +337,3 @@ def test_pairs_are_retried_by_the_matches_that_are_counted(
         counts = scene.retry(kind, tmp_path / count, options=options, num_found=found)
         assert counts["pairs_tried"] == len(expected)
     assert len(hard) > 1
-
-
-def test_without_verification_every_match_of_a_variant_is_kept(
-    scene: Scene, tmp_path: Path
-) -> None:
-    one_turn = GuidedPyramidOptions(mode="max", scales=(1.0,), rotations_deg=(270,))
-    unverified = scene.retry("turned", tmp_path / "a", options=one_turn, verification=None)
-    verified = scene.retry("turned", tmp_path / "b", options=one_turn)
-    assert unverified["pairs_tried"] == verified["pairs_tried"] > 0
-    assert unverified["matches_after"] > verified["matches_after"]
-
-
-def test_added_features_follow_those_of_the_source(write_features: Any, tmp_path: Path) -> None:
-    camera = Sensor.from_camera(Camera.pinhole(40, 30, 50.0))
-    records = {(0, "cam"): "a.png", (1, "cam"): "b.png"}
-    write_sensors(tmp_path, KaptureData(sensors={"cam": camera}, records_camera=records))
-    rng = np.random.default_rng(0)
-    before = {"keypoints": rng.random((4, 3)).astype(np.float32)}
-    before["descriptors"] = rng.integers(0, 255, (4, 5)).astype(np.uint8)
-    for kind, rows in before.items():
-        write_features(tmp_path, kind, "toy", {"a.png": rows, "b.png": rows})
-    folder = KaptureFolder(tmp_path, features_dirs=[tmp_path])
-    added = np.full((2, 3), 7.5, np.float32), np.full((2, 5), 9, np.uint8)
-    features = PyramidFeatures(tmp_path / "out", folder, "toy")
-    features.write("a.png", *added)
-    features.write_rest()  # of b.png
-    out = folder.with_features([tmp_path, tmp_path / "out"])
-    for kind, rows, new in zip(("keypoints", "descriptors"), before.values(), added, strict=True):
-        reader, source = (getattr(out, kind)(name) for name in ("toy-pyramid", "toy"))
-        np.testing.assert_array_equal(reader.read("a.png"), np.concatenate([rows, new]))
-        assert Path(reader.where("b.png")).samefile(source.where("b.png"))
-    images = ("a.png", "b.png")
-    write_features(tmp_path, "keypoints", "few", dict.fromkeys(images, before["keypoints"]))
-    write_features(tmp_path, "descriptors", "few", dict.fromkeys(images, before["descriptors"][1:]))
-    with pytest.raises(DataError, match=r"a\.png.*: 3 descriptors for 4 keypoints"):
-        PyramidFeatures(tmp_path / "out", folder, "few")

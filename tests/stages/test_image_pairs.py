@@ -19,9 +19,7 @@ from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
     MatchesWriter,
-    read_pairs,
     write_observations,
-    write_pairs,
     write_points3d,
     write_sensors,
 )
@@ -42,7 +40,7 @@ from megloc_kapture.stages.image_pairs import (
     reranked,
     vectors_of,
 )
-from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
+from megloc_kapture.stages.matches import VerifiedMatches
 
 VECTORS = {
     # two copies, one near them, one across, one opposite
@@ -119,35 +117,25 @@ def shared_points(folder: KaptureFolder) -> dict[tuple[str, str], int]:
     return {(a, b): len(seen[a] & seen[b]) for a, b in combinations(sorted(seen), 2)}
 
 
-def test_map_pairs_by_covisibility(world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    shared = shared_points(world.map())
-    least = sorted(shared.values())[5]
-    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", least)
-    options = {"by": ("covisibility",)}
-    expected = sorted(pair for pair, count in shared.items() if count >= least)
-    assert 0 < len(expected) < 10
-    found = paired(world.map(), **options)
-    assert names(found) == expected and {pair.score for pair in found} == {1.0}
-    # images of one kapture, points of another
-    assert paired(world.mapping(), world.map(), **options) == found
-    with pytest.raises(DataError, match="mapping: no map to pair images by co-visibility"):
-        paired(world.mapping(), **options)
-
-
-def test_points_of_all_types_count(
+def test_map_pairs_by_covisibility_count_points_of_all_types(
     world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two images that share points of two types share the sum."""
     seen, points = world.map().observations()["rootsift"], world.map().points3d()
-    again = replace(seen, keypoints_type="other", point_ids=seen.point_ids + len(points))
+    other = replace(seen, keypoints_type="other", point_ids=seen.point_ids + len(points))
     write_sensors(tmp_path, world.map().read())
     write_points3d(tmp_path, np.concatenate([points] * 2))
-    write_observations(tmp_path, {"rootsift": seen, "other": again})
-    shared = shared_points(world.map())
-    most = max(shared.values())
-    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", 2 * most)
-    found = paired(KaptureFolder(tmp_path), by=("covisibility",))
-    assert names(found) == sorted(pair for pair, count in shared.items() if count == most)
+    write_observations(tmp_path, {"rootsift": seen, "other": other})
+    two_types = KaptureFolder(tmp_path)
+    shared = shared_points(two_types)
+    least = sorted(shared.values())[5]
+    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", least)
+    found = paired(two_types, by=("covisibility",))
+    expected = sorted(pair for pair, count in shared.items() if count >= least)
+    assert names(found) == expected and {pair.score for pair in found} == {1.0}
+    # images of one folder, points of another
+    assert paired(world.mapping(), two_types, by=("covisibility",)) == found
+    with pytest.raises(DataError, match="mapping: no map to pair images by co-visibility"):
+        paired(world.mapping(), by=("covisibility",))
 
 
 def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -> None:
@@ -223,9 +211,6 @@ def test_images_without_global_features_are_named(world: Any) -> None:
         pair_queries(world.mapping(), world.query(), QueryPairsOptions(), retrieval=None)
 
 
-# -------------------------------------------------------------------------------------- reranking
-
-
 PAIRS = [
     *(ImagePair("q1", image, 0.9 - 0.1 * rank) for rank, image in enumerate("zyxw")),
     *(ImagePair("q2", image, 0.3 - 0.1 * rank) for rank, image in enumerate("xy")),
@@ -247,10 +232,6 @@ def run(root: Path, names: str, by: Any, keep: int) -> dict[str, list[tuple[str,
     """Return the images that each query keeps, with their counts."""
     query = KaptureFolder(root, features_dirs=[root])
     found = reranked(PAIRS, query, root, list(names), RerankingOptions(by=by, keep=keep))
-    write_pairs(root / "pairs.txt", found)
-    assert dict(iterate_candidates(read_pairs(root / "pairs.txt"))) == {
-        q: [pair.map for pair in found if pair.query == q] for q in ("q1", "q2")
-    }, "the order in the file is another"
     return {q: [(p.map, int(p.score)) for p in found if p.query == q] for q in ("q1", "q2")}
 
 
@@ -302,9 +283,6 @@ def test_coverage_counts_each_keypoint_once(tmp_path: Path) -> None:
     of_types = [[np.array([2]), np.array([1])], [np.array([1, 2]), np.array([1, 3])]]
     options = RerankingOptions(by="coverage", keep=2)
     assert rerank(of_types, options) == ([0, 1], [3, 2])
-
-
-# ------------------------------------------------------------------------- fusion, restrictions
 
 
 def test_several_global_features_are_fused_with_their_weights(
