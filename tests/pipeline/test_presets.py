@@ -127,9 +127,7 @@ def test_repeated_types_are_refused() -> None:
 
 
 def test_missing_weights_have_a_download_command() -> None:
-    with pytest.raises(
-        DataError, match=r"aliked-n16.pth .*https://.*megloc weights fetch"
-    ):
+    with pytest.raises(DataError, match=r"aliked-n16.pth .*https://.*megloc weights fetch"):
         options_of_preset("modern").make_extractors()
 
 

@@ -40,6 +40,7 @@ from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
 from megloc_kapture.stages.stage import wanted_stages
 from megloc_kapture.stages.work import Work, in_batches, is_out_of_memory
 from megloc_kapture.values import ImageFeatures, LocalFeatures
+from tests.worlds import folder_bytes
 
 Image = NDArray[np.uint8]
 NAMES = [f"{k}.jpg" for k in range(5)]
@@ -204,7 +205,6 @@ def test_one_thread_uses_the_gpu(
     world: Any,
     tmp_path: Path,
     two_processes: Executor,
-    folder_bytes: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folders = [world.mapping(), world.query()]

@@ -23,6 +23,7 @@ from megloc_kapture.stages.global_features import (
     write_vocabulary,
 )
 from megloc_kapture.stages.work import Work
+from tests.worlds import folder_bytes
 
 
 class Colours:
@@ -54,7 +55,7 @@ def read(folder: Path, name: str) -> dict[str, np.ndarray]:
 
 
 def test_images_are_described_alone_or_in_batches(
-    world: Any, tmp_path: Path, folder_bytes: Any, monkeypatch: pytest.MonkeyPatch
+    world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(devices, "BATCH", 4)
     folders, many = [world.mapping(), world.query()], ManyColours()
@@ -117,9 +118,7 @@ def assert_described_by(root: Path, folders: list[KaptureFolder], options: VladO
             np.testing.assert_allclose(stored.read(image), expected, atol=1e-5)
 
 
-def test_the_vocabulary_does_not_depend_on_the_queries(
-    world: Any, tmp_path: Path, folder_bytes: Any
-) -> None:
+def test_the_vocabulary_does_not_depend_on_the_queries(world: Any, tmp_path: Path) -> None:
     assert_described_by(world.features_dir, [world.mapping(), world.query()], VLAD)
     with single_threaded():
         extract_vlad(world.mapping(), [world.mapping()], "rootsift", tmp_path, VLAD)

@@ -1,4 +1,4 @@
-"""A map of points lifted from depth maps, against the exact walls of the rendered scene."""
+"""Triangulated and lifted maps: accurate, complete and read by kapture."""
 
 from __future__ import annotations
 
@@ -6,17 +6,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import kapture.io.csv
 import numpy as np
 import pytest
 from corner import CAMERA, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.io.kapture import KaptureFolder, write_sensors
+from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.kapture import (
+    ImagePair,
+    KaptureFolder,
+    MatchesWriter,
+    write_sensors,
+)
 from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.stages.map_points import lift_map
+from megloc_kapture.stages.map_points import lift_map, triangulate_map
 from megloc_kapture.stages.scene import depth_records, index_map
 from megloc_kapture.values import RigidTransform
+from tests.worlds import folder_bytes
 
 IMAGES = ("left/0.png", "right/2.png", "right/4.png")
 
@@ -71,3 +81,169 @@ def test_a_map_without_depth_is_refused(mapping: KaptureFolder, tmp_path: Path) 
     write_sensors(tmp_path, replace(mapping.read(), records_depth={}))
     with pytest.raises(DataError, match="no mapping image has a pose and a depth map"):
         lift_map(KaptureFolder(tmp_path), ["rootsift"], tmp_path / "map")
+
+
+def test_points_lie_on_the_walls(world: Any, distance_to_walls: Any) -> None:
+    distance = distance_to_walls(world.map().points3d()[:, :3])
+    assert len(distance) > 300
+    assert np.median(distance) < 0.005
+    assert (distance < 0.05).mean() > 0.98
+
+
+KINDS = ("keypoints", "descriptors")
+
+
+def arrays(folder: KaptureFolder, kind: str) -> dict[str, Any]:
+    """The features of the type ``rootsift`` by image."""
+    reader = getattr(folder, kind)("rootsift")
+    return {image: reader.read(image) for image in reader.names}
+
+
+def test_observed_points_project_to_their_keypoints(world: Any) -> None:
+    folder = world.map()
+    data = folder.read()
+    xyz = folder.points3d()[:, :3]
+    observations = folder.observations()["rootsift"]
+    assert observations.image_names == tuple(sorted(world.map_poses))
+    # COLMAP makes points of at least three images and may remove one observation
+    lengths = np.bincount(observations.point_ids, minlength=len(xyz))
+    assert lengths.min() >= 2 and (lengths >= 3).mean() > 0.95
+    for image_id, image in enumerate(observations.image_names):
+        here = observations.image_ids == image_id
+        keypoints = folder.keypoints("rootsift").read(image)
+        pixels = project(
+            data.camera_of(image), world.map_poses[image], xyz[observations.point_ids[here]]
+        )
+        errors = np.linalg.norm(pixels - keypoints[observations.keypoint_ids[here]], axis=1)
+        assert errors.max() < 4.5 and np.median(errors) < 0.5
+
+
+def test_the_map_contains_everything_for_localization(world: Any) -> None:
+    folder = KaptureFolder(world.root / "map")
+    folder.validate(deep=True)
+    assert folder.read().poses().keys() == world.map_poses.keys()
+    ours, given = folder.read(), world.mapping().read()
+    assert ours.sensors == given.sensors and ours.trajectories == given.trajectories
+    for kind in KINDS:
+        features, extracted = arrays(folder, kind), arrays(world.mapping(), kind)
+        assert features.keys() == world.map_poses.keys()  # without the queries
+        for image, array in features.items():
+            np.testing.assert_array_equal(array, extracted[image])
+    # features and images are links
+    file = "keypoints/left/0.png.kpt"
+    linked = folder.root / "reconstruction" / file.replace("/", "/rootsift/", 1)
+    assert linked.samefile(world.features_dir / "local_features" / "rootsift" / file)
+    link, source = (one.root / "sensors" / "records_data" for one in (folder, world.mapping()))
+    assert link.is_symlink() and link.resolve() == source.resolve()
+    assert folder.global_features("vlad_rootsift").names == sorted(world.map_poses)
+    place = world.root / "map" / "reconstruction" / "global_features" / "vlad_rootsift"
+    assert (place / "vocabulary.npy").is_file() and (place / "vlad.json").is_file()
+
+
+def test_kapture_reads_the_map(world: Any) -> None:
+    theirs = kapture.io.csv.kapture_from_dir(str(world.root / "map"))
+    ours = world.map()
+    np.testing.assert_array_equal(theirs.points3d.as_array(), ours.points3d())
+    observations = ours.observations()["rootsift"]
+    expected: dict[int, list[tuple[str, int]]] = {}
+    columns = observations.point_ids, observations.image_ids, observations.keypoint_ids
+    for point, image, keypoint in np.stack(columns, axis=1).tolist():
+        expected.setdefault(point, []).append((observations.image_names[image], keypoint))
+    assert {point: theirs.observations[point, "rootsift"] for point in expected} == expected
+    assert len(theirs.observations) == len(expected)
+    assert set(theirs.keypoints["rootsift"]) == set(world.map_poses)
+    assert set(theirs.descriptors["rootsift"]) == set(world.map_poses)
+    assert set(theirs.global_features["vlad_rootsift"]) == set(world.map_poses)
+    for image, expected_pose in world.map_poses.items():
+        pose = theirs.trajectories[ours.read().record_of(image)]
+        np.testing.assert_allclose(pose.t_raw, expected_pose.translation, atol=1e-12)
+
+
+def test_only_given_pairs_are_triangulated(world: Any, tmp_path: Path) -> None:
+    pairs = [
+        ImagePair("right/2.png", "left/0.png", 1.0),
+        ImagePair("left/0.png", "left/1.png", 1.0),
+    ]
+    counts = triangulate_map(
+        world.mapping(), world.with_matches("mapping"), "rootsift", tmp_path,
+        TriangulationOptions(two_view_tracks=True), pairs=pairs,
+    )  # fmt: skip
+    assert counts["pairs"] == 2 and counts["points"] > 100
+    observations = KaptureFolder(tmp_path).observations()["rootsift"]
+    assert {observations.image_names[i] for i in set(observations.image_ids.tolist())} == {
+        "left/0.png",
+        "left/1.png",
+        "right/2.png",
+    }
+
+
+def test_missing_poses_and_matches_are_refused(world: Any, tmp_path: Path) -> None:
+    matches, options = world.with_matches("mapping"), TriangulationOptions()
+    with pytest.raises(DataError, match="no mapping image has a pose"):
+        triangulate_map(world.query(), matches, "rootsift", tmp_path, options)
+    with pytest.raises(DataError, match="no matches of type 'r2d2'"):
+        triangulate_map(world.mapping(), matches, ["rootsift", "r2d2"], tmp_path, options)
+    assert not any(tmp_path.iterdir())
+
+
+def test_features_inside_the_mapping_folder_come_first(
+    world: Any, write_features: Any, tmp_path: Path
+) -> None:
+    root, image = tmp_path / "mapping", "right/2.png"
+    write_sensors(root, world.mapping().read())
+    link_images(world.mapping().root, root)
+    extracted = arrays(world.mapping(), "keypoints")
+    inside = {image: extracted[image][::-1].copy()}
+    write_features(root, "keypoints", "rootsift", inside, orphan=False, tar=True)
+    mapping = KaptureFolder(root, features_dirs=[world.features_dir])
+    options = TriangulationOptions()
+    triangulate_map(mapping, world.with_matches("mapping"), "rootsift", tmp_path / "map", options)
+    stored = arrays(KaptureFolder(tmp_path / "map"), "keypoints")
+    np.testing.assert_array_equal(stored[image], inside[image])
+    np.testing.assert_array_equal(stored["left/0.png"], extracted["left/0.png"])
+
+
+def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_path: Path) -> None:
+    features = tmp_path / "features"
+    for kind in KINDS:
+        half = {
+            image: array[::2]
+            for image, array in arrays(KaptureFolder(world.root / "map"), kind).items()
+        }
+        write_features(features, kind, "half", half)
+    mapping = KaptureFolder(world.root / "mapping", features_dirs=[world.features_dir, features])
+    reader = world.with_matches("mapping").matches("rootsift")
+    with MatchesWriter(features, "half", orphan=True) as writer:
+        for a, b in reader.pairs:
+            rows, scores = reader.read(a, b)
+            even = (rows % 2 == 0).all(axis=1)
+            writer.write(a, b, rows[even] // 2, scores[even].astype(np.float32))
+    places = [world.root / "matches" / "mapping", features]
+    matches = KaptureFolder(world.root / "mapping", features_dirs=places)
+    both, alone = tmp_path / "both", tmp_path / "alone"
+    options = TriangulationOptions()
+    counts = triangulate_map(mapping, matches, ["rootsift", "half", "half"], both, options)
+    half = triangulate_map(mapping, matches, "half", alone, options)
+    found, single = KaptureFolder(both), KaptureFolder(alone)
+    found.validate(deep=True)
+    num_first, num_second = len(world.map().points3d()), len(single.points3d())
+    assert num_second > 30
+    np.testing.assert_array_equal(
+        found.points3d(), np.concatenate([world.map().points3d(), single.points3d()])
+    )
+    assert observed(found, "rootsift") == observed(world.map(), "rootsift")
+    assert observed(found, "half", num_first) == observed(single, "half")
+    assert found.types("keypoints") == found.types("descriptors") == ["half", "rootsift"]
+    assert counts["points_rootsift"] == num_first and counts["points_half"] == num_second
+    assert counts["points"] == num_first + num_second
+    assert counts["observations_half"] == half["observations"] and counts["pairs"] == 20
+    again = tmp_path / "again"
+    triangulate_map(mapping, matches, ["rootsift", "half"], again, options, num_threads=3)
+    assert folder_bytes(both) == folder_bytes(again)
+
+
+def observed(folder: KaptureFolder, name: str, offset: int = 0) -> list[Any]:
+    """Return the image names, points, image rows and keypoints of a type."""
+    seen = folder.observations()[name]
+    columns = seen.point_ids - offset, seen.image_ids, seen.keypoint_ids
+    return [seen.image_names, *(column.tolist() for column in columns)]

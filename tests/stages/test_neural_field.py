@@ -19,16 +19,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 pytest.importorskip("torch")
 
-from megloc_kapture.io.images import write_depth_map, write_image  # noqa: E402
-from megloc_kapture.io.kapture import (  # noqa: E402
-    KaptureData,
-    KaptureFolder,
-    Sensor,
-    write_sensors,  # noqa: E402
-)
-from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.refinement.acceptance import RenderingOptions  # noqa: E402
-from megloc_kapture.refinement.field_training import FieldTrainingOptions  # noqa: E402
 from megloc_kapture.refinement.neural_field import FieldRendering  # noqa: E402
 from megloc_kapture.refinement.references import RenderingQuery, RenderingReference  # noqa: E402
 from megloc_kapture.refinement.rendering import judge_by_rendering  # noqa: E402
@@ -147,38 +138,3 @@ def test_appearance_and_acceptance_use_different_halves_of_the_image(
     assert by_one.accepted and not by_other.accepted, (by_one, by_other)
     assert by_other.measures["correlation_after"] < 0.2 < by_one.measures["correlation_after"]
     assert by_one.measures["points"] < 0.6 * by_all.measures["points"]
-
-
-@pytest.mark.slow
-def test_a_trained_field_refines_poses(tmp_path: Path) -> None:
-    data = KaptureData(sensors={"cam": Sensor.from_camera(room.CAMERA)})
-    data.sensors["depth"] = Sensor.from_camera(room.CAMERA, sensor_type="depth")
-    data.rigs["both"] = dict.fromkeys(("cam", "depth"), RigidTransform.identity())
-    images = tmp_path / "map" / "sensors" / "records_data"
-    images.mkdir(parents=True)
-    for number, pose in enumerate(room.poses(40, 1)):
-        name = f"{number:03}.png"
-        moving = number if number % 5 < 3 else None
-        seen = room.render(pose, light=number % 2, moving=moving)
-        write_image(images / name, seen.image)
-        write_depth_map(images / f"{name}.depth", seen.depth_m)
-        data.records_camera[number, "cam"] = name
-        data.records_depth[number, "depth"] = f"{name}.depth"
-        data.trajectories[number, "cam"] = pose
-    write_sensors(tmp_path / "map", data)
-    out = tmp_path / "field"
-    out.mkdir()
-    rng = np.random.default_rng(5)
-    errors = []
-    with single_threaded():
-        options = FieldTrainingOptions(steps=1500, rays_per_step=1024, device="cpu")
-        neural_field.train_field_of_map(KaptureFolder(tmp_path / "map"), out, options)
-        for number, truth in enumerate(room.poses(20, 7)):
-            moving = number if number % 4 == 3 else None
-            seen = room.render(truth, light=number % 2, moving=moving)
-            found = refined(out, room.CAMERA, seen.image, perturbed(truth, 0.1, 2.0, rng))
-            errors.append(movement(truth, found.cam_from_world))
-
-    median = np.median(errors, axis=0)
-
-    assert median[0] < 0.02 and median[1] < 0.5

@@ -30,6 +30,7 @@ from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_
 from megloc_kapture.stages.query_poses import write_localized
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from tests.worlds import folder_bytes
 
 COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 1 / 3])
 SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
@@ -102,7 +103,7 @@ def localized(world: Any, tmp_path: Path) -> KaptureFolder:
 
 
 def test_refiners_are_applied_in_order_and_failures_stay(
-    world: Any, localized: KaptureFolder, tmp_path: Path, folder_bytes: Any
+    world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
     first, second = sorted(world.query_poses)
     options = Chosen(refiners=(Shift(), Shift(stays=first), Shift()))

@@ -1,8 +1,11 @@
-"""Images of a rig at one timestamp, with poses against compositions by kapture."""
+"""Rigs and the map index: poses of other cameras, and an index shared by processes."""
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import kapture
 import numpy as np
@@ -10,8 +13,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import KaptureData, Sensor
-from megloc_kapture.stages.scene import depth_records, poses_through_rig, query_units
+from megloc_kapture.io.kapture import (
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    write_observations,
+    write_points3d,
+)
+from megloc_kapture.io.kapture.points import write_point_covariances
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.stages.scene import (
+    depth_records,
+    index_map,
+    open_index,
+    poses_through_rig,
+    query_units,
+    shared_index,
+    with_noise,
+    write_index,
+)
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))
@@ -99,3 +119,99 @@ def test_units_are_images_or_the_cameras_of_a_rig(data: KaptureData) -> None:
     assert [pose for _, pose in together[0]] == list(data.rigs["car"].values())
     # a single camera needs no rig
     assert together[2] == (("left/3.jpg", same),)
+
+
+NAMES = ("a/é.jpg", "b\n.jpg", "c.jpg")
+ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids")
+
+
+def make_index(*, covariances: bool = False) -> MapIndex:
+    rng = np.random.default_rng(0)
+    images, keypoints, points = (rng.integers(0, n, 200) for n in (3, 50, 40))
+    known = rng.normal(size=(40, 6)) if covariances else None
+    xyz = rng.normal(size=(40, 3)) + 4e6
+    return MapIndex.build(xyz, NAMES, images, keypoints, points, known)
+
+
+def empty_index() -> MapIndex:
+    none = np.zeros(0, dtype=np.int64)
+    return MapIndex.build(np.zeros((0, 3)), (), none, none, none)
+
+
+@pytest.mark.parametrize(
+    "index", [make_index(), make_index(covariances=True), empty_index()], ids=str
+)
+def test_a_written_index_is_opened_without_reading_it(index: MapIndex, tmp_path: Path) -> None:
+    write_index(index, tmp_path / "index")
+    opened = open_index(tmp_path / "index")
+    assert opened.row_of_image == index.row_of_image
+    for name in ARRAYS:
+        mine, theirs = getattr(opened, name), getattr(index, name)
+        assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape)
+        np.testing.assert_array_equal(mine, theirs)
+        assert not mine.flags.writeable
+        assert len(mine) == 0 or isinstance(mine.base, np.memmap)
+    assert (opened.covariances is None) == (index.covariances is None)
+    if index.covariances is not None:
+        np.testing.assert_array_equal(opened.covariances, index.covariances)
+
+
+def test_files_of_a_shared_index_are_removed() -> None:
+    index = make_index()
+    with shared_index({"sift": index, "other": empty_index()}) as folders:
+        assert list(folders) == ["sift", "other"]
+        opened = open_index(folders["sift"])
+    assert not any(folder.parent.exists() for folder in folders.values())
+    # an open index stays valid
+    found = opened.shared_points(NAMES).tolist()
+    assert found == index.shared_points(NAMES).tolist()
+
+
+def test_the_index_is_of_one_keypoints_type(world: Any) -> None:
+    index = index_map(world.map(), "rootsift")
+    observations = world.map().observations()["rootsift"]
+    assert len(index.keypoint_ids) == len(observations.point_ids)
+    rows = observations.image_ids == 2
+    ascending = np.argsort(observations.keypoint_ids[rows], kind="stable")
+    keypoints, points = index.observed("right/2.png")
+    np.testing.assert_array_equal(keypoints, observations.keypoint_ids[rows][ascending])
+    np.testing.assert_array_equal(points, observations.point_ids[rows][ascending])
+    assert index.covariances is None
+    with pytest.raises(DataError, match="no observations of type 'other'"):
+        index_map(world.map(), "other")
+
+
+def test_a_map_without_points_has_an_empty_index(world: Any, tmp_path: Path) -> None:
+    whole = world.map()
+    root = Path(shutil.copytree(whole.root, tmp_path / "map", symlinks=True))
+    write_points3d(root, np.zeros((0, 6)))
+    write_observations(root, {})
+    empty = KaptureFolder(root, features_dirs=whole.features_dirs)
+    index = index_map(empty, "rootsift")
+    assert index.xyz.shape == (0, 3) and not index.row_of_image
+
+
+def test_covariances_of_the_map_are_read(world: Any, tmp_path: Path) -> None:
+    folder = KaptureFolder(shutil.copytree(world.map().root, tmp_path / "map"))
+    count = len(folder.points3d())
+    known = np.arange(6.0 * count).reshape(count, 6)
+    write_point_covariances(folder.root, known)
+    index = index_map(folder, "rootsift")
+    np.testing.assert_array_equal(index.covariances, known)
+
+
+def test_noise_is_measured_by_points_with_several_observations(world: Any) -> None:
+    folder = world.map()
+    measured = with_noise(folder, index_map(folder, "rootsift"))
+    assert 0.02 < measured.noise_px < 1
+    assert measured.noise_rad == pytest.approx(measured.noise_px / 300, rel=0.5)
+    # lifted points have one observation, without error
+    once = np.unique(measured.point_ids, return_index=True)[1]
+    images = np.repeat(np.arange(len(measured.row_of_image)), np.diff(measured.offsets))[once]
+    lifted = MapIndex.build(
+        measured.xyz, tuple(measured.row_of_image), images, measured.keypoint_ids[once],
+        measured.point_ids[once],
+    )  # fmt: skip
+    lifted = replace(lifted, local_type="rootsift")
+    assert lifted.seen_once.all()
+    assert np.isnan(with_noise(folder, lifted).noise_px)
