@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.pose_files import read_mlad_file, read_pose_file, write_provenance
+from megloc_kapture.evaluation.pose_files import read_pose_file, write_provenance
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
@@ -61,14 +61,6 @@ def random_poses(number: int, seed: int = 0) -> list[RigidTransform]:
     return [RigidTransform.from_matrix(r, t) for r, t in zip(turns, shifts, strict=True)]
 
 
-def matrix(pose: RigidTransform) -> np.ndarray:
-    w, x, y, z = pose.quat_wxyz
-    whole = np.eye(4)
-    whole[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-    whole[:3, 3] = pose.translation
-    return whole
-
-
 class Dataset:
     """An imported rig of three cameras at four timestamps, and a result for it."""
 
@@ -92,10 +84,6 @@ class Dataset:
             image: ImageGroup(scored="/rear/" in image) for image in self.query.image_names()
         }
         write_groups(self.tables, self.groups)
-        self.names = {
-            f"{'night' if time > 20 else 'dawn'}/rear/{time}.jpg": f"rear/{time}.png"
-            for time in (40, 10, 30, 20)
-        }
 
     def true_pose(self, image: str) -> RigidTransform:
         time, side = self.query.record_of(image)
@@ -148,42 +136,35 @@ def test_names_with_white_space_are_left_out(
     place = tmp_path / "poses.txt"
     counts = write_submission(tmp_path / "localized", place, tables=None, provenance={})
     assert list(read_pose_file(place)) == ["f.jpg"]
-    assert (counts["poses"], counts["missing"]) == (1, 2)
+    assert (counts["scored"], counts["poses"], counts["missing"]) == (3, 1, 2)
     assert "2 images have no row in the pose file" in caplog.text and "'a b.jpg'" in caplog.text
-    # without its folder the second name has no white space
-    write_protocol(tmp_path / "megloc", Protocol(pose_file_names="basename"))
-    counts = write_submission(
-        tmp_path / "localized", place, tables=tmp_path / "megloc", provenance={}
-    )
-    assert list(read_pose_file(place)) == ["e.jpg", "f.jpg"] and counts["missing"] == 1
 
 
 def test_doubtful_queries_are_counted(dataset: Dataset, tmp_path: Path) -> None:
-    doubtful = {**FAILED, "confidence": 0.3}
-    fallback = {**doubtful, "fallback": "retrieval"}
-    dataset.localize(["dawn/rear/10.jpg", "dawn/rear/20.jpg"], {})
-    # the second is not scored, and the last failed without a pose
-    statuses = {
-        "dawn/rear/20.jpg": fallback,
-        "dawn/left/10.jpg": doubtful,
-        "night/rear/30.jpg": doubtful,
-        "night/rear/40.jpg": FAILED,
-    }
-    rows = [LocalizationResult(name=image, **status) for image, status in statuses.items()]
+    dataset.localize(["dawn/rear/10.jpg"], {})
+    rows = [
+        LocalizationResult(name="dawn/left/10.jpg", confidence=0.3, **FAILED),  # not scored
+        LocalizationResult(name="night/rear/30.jpg", confidence=0.3, **FAILED),
+        LocalizationResult(name="night/rear/40.jpg", **FAILED),  # without a pose
+    ]
     write_status(dataset.result / "status.csv", rows)
     counts, _ = submit(dataset, tmp_path / "poses.txt")
-    assert (counts["poses"], counts["missing"], counts["fallbacks"]) == (2, 2, 1)
-    assert counts["doubtful"] == 1
+    assert (counts["poses"], counts["missing"], counts["doubtful"]) == (1, 3, 1)
 
 
 def test_the_list_of_names_sets_names_and_order(dataset: Dataset, tmp_path: Path) -> None:
-    write_names(dataset.tables, dataset.names)
+    names = {
+        "night/rear/40.jpg": "rear/40.png",
+        "dawn/rear/10.jpg": "rear/10.png",
+        "night/rear/30.jpg": "rear/30.png",
+    }
+    write_names(dataset.tables, names)
     dataset.localize(dataset.query.image_names(), {})
     counts, _ = submit(dataset, tmp_path / "poses.txt")
     found = read_pose_file(tmp_path / "poses.txt")
-    assert list(found) == ["rear/40.png", "rear/10.png", "rear/30.png", "rear/20.png"]
+    assert list(found) == list(names.values())
     assert found["rear/30.png"] == dataset.true_pose("night/rear/30.jpg")
-    assert counts["poses"] == counts["scored"] == 4
+    assert (counts["scored"], counts["poses"]) == (3, 3)
 
 
 def test_kapture_reads_poses_in_the_ltvl_format(dataset: Dataset, tmp_path: Path) -> None:
@@ -199,9 +180,9 @@ def test_poses_are_written_in_the_official_frame(dataset: Dataset, tmp_path: Pat
     write_world(dataset.tables, World(official_from_local=FAR))
     dataset.localize(["dawn/rear/10.jpg"], {})
     submit(dataset, tmp_path / "poses.txt")
-    pose = matrix(read_pose_file(tmp_path / "poses.txt")["dawn/rear/10.jpg"])
+    pose = read_pose_file(tmp_path / "poses.txt")["dawn/rear/10.jpg"].matrix()
     points = np.random.default_rng(0).normal(size=(5, 3)) * 10
-    local = matrix(dataset.true_pose("dawn/rear/10.jpg"))
+    local = dataset.true_pose("dawn/rear/10.jpg").matrix()
     turn = Rotation.from_quat(np.roll(FAR.quat_wxyz, -1))
     official = 1.25 * turn.apply(points) + FAR.translation
     np.testing.assert_allclose(
@@ -209,12 +190,6 @@ def test_poses_are_written_in_the_official_frame(dataset: Dataset, tmp_path: Pat
         1.25 * (points @ local[:3, :3].T + local[:3, 3]),
         atol=1e-8,
     )
-
-
-def test_without_tables_all_images_are_scored(dataset: Dataset, tmp_path: Path) -> None:
-    dataset.localize(["dawn/left/10.jpg"], {})
-    counts = write_submission(dataset.result, tmp_path / "poses.txt", tables=None, provenance={})
-    assert (counts["queries"], counts["scored"], counts["poses"]) == (12, 12, 1)
 
 
 def test_inconsistent_results_are_refused(dataset: Dataset, tmp_path: Path) -> None:
@@ -252,7 +227,7 @@ def test_poses_of_the_rig_are_optional(dataset: Dataset, tmp_path: Path) -> None
     assert list(found) == ["dawn/rear/10.jpg", "dawn/rear/20.jpg"]
     assert (counts["poses"], counts["fallbacks"], counts["from_rig"]) == (2, 0, 2)
     for image, pose in found.items():
-        np.testing.assert_allclose(matrix(pose), matrix(dataset.true_pose(image)), atol=1e-9)
+        np.testing.assert_allclose(pose.matrix(), dataset.true_pose(image).matrix(), atol=1e-9)
     assert provenance["counts"]["from_rig"] == 2
     # earlier poses of the rig are counted
     dataset.localize(["dawn/rear/10.jpg"], {"dawn/rear/10.jpg": {**FAILED, "fallback": "rig"}})
@@ -260,98 +235,65 @@ def test_poses_of_the_rig_are_optional(dataset: Dataset, tmp_path: Path) -> None
     assert (counts["poses"], counts["fallbacks"], counts["from_rig"]) == (1, 0, 1)
 
 
-class Drives:
-    """A map and queries of 4Seasons, and pairs of them in two relocalization files."""
+STAMPS = [1602074877390449152 + 33_333_333 * number for number in range(7)]
+PAIRS = [(2, 5), (0, 4), (3, 6)]  # of an image of the map and a query; query 6 has no pose
+DUMMY = "0.0 0.0 0.0 0.0 0.0 0.0 1.0"
 
-    def __init__(self, root: Path, world: World) -> None:
-        self.root, self.tables, self.result = root, root / "megloc", root / "localized"
-        start = 1602074877390449152
-        poses = random_poses(9)
-        stamps = [start + 33_333_333 * i for i in range(9)]
 
-        def drive(folder: str, images: slice, posed: slice) -> KaptureData:
-            at = zip(stamps[posed], poses[posed], strict=True)
-            return KaptureData(
-                sensors={"cam0": CAMERA},
-                trajectories={(t, "cam0"): pose for t, pose in at},
-                records_camera={(t, "cam0"): f"{folder}/cam0/{t}.png" for t in stamps[images]},
-            )
+def write_drives(root: Path) -> KaptureData:
+    """Write a map, localized queries and relocalization pairs of 4Seasons; return both drives."""
+    poses = random_poses(7)
 
-        self.mapping = drive("ref", slice(5), slice(4))
-        self.localized = drive("test", slice(5, None), slice(5, 8))
-        write_sensors(root / "mapping", self.mapping)
-        write_sensors(root / "query", replace(self.localized, trajectories={}))
-        write_sensors(self.result, self.localized)
-        write_protocol(self.tables, Protocol(dataset="4seasons", pose_file="mlad"))
-        write_world(self.tables, world)
-        pairs = [(3, 7), (0, 5), (1, 6), (2, 8)]
-        self.pairs = [(stamps[r], stamps[q]) for r, q in pairs]
-        self.rows = [
-            RelocalizationPair("a_to_b.txt", f"ref/cam0/{r}.png", f"test/cam0/{q}.png")
-            for r, q in self.pairs
-        ]
-        self.unposed = RelocalizationPair(
-            "sub/b.txt", f"ref/cam0/{stamps[4]}.png", f"test/cam0/{stamps[5]}.png"
+    def drive(numbers: range, posed: range) -> KaptureData:
+        folder = "ref" if numbers.start == 0 else "test"
+        return KaptureData(
+            sensors={"cam0": CAMERA},
+            trajectories={(STAMPS[n], "cam0"): poses[n] for n in posed},
+            records_camera={(STAMPS[n], "cam0"): f"{folder}/cam0/{STAMPS[n]}.png" for n in numbers},
         )
-        write_relocalization(self.tables, [*self.rows, self.unposed])
+
+    mapping, localized = drive(range(4), range(4)), drive(range(4, 7), range(4, 6))
+    write_sensors(root / "mapping", mapping)
+    write_sensors(root / "query", replace(localized, trajectories={}))
+    write_sensors(root / "localized", localized)
+    write_protocol(root / "megloc", Protocol(dataset="4seasons", pose_file="mlad"))
+    write_world(root / "megloc", World(official_from_local=FAR))
+    names = [f"ref/cam0/{t}.png" if n < 4 else f"test/cam0/{t}.png" for n, t in enumerate(STAMPS)]
+    rows = [RelocalizationPair("sub/a.txt", names[r], names[q]) for r, q in PAIRS]
+    write_relocalization(root / "megloc", rows)
+    return KaptureData(
+        sensors=mapping.sensors,
+        rigs={"car": {"cam0": RigidTransform.identity()}},  # kapture's exporter needs rigs
+        trajectories=mapping.trajectories | localized.trajectories,
+        records_camera=mapping.records_camera | localized.records_camera,
+    )
 
 
-def test_mlad_files_equal_those_of_kapture(tmp_path: Path) -> None:
+def test_mlad_files_equal_those_of_kapture_and_list_dummies(tmp_path: Path) -> None:
     from tools.kapture_export_4seasons_pairs import export_4seasons_pairfile
 
-    origin = SimilarityTransform(quat_wxyz=FAR.quat_wxyz, translation=FAR.translation)
-    drives = Drives(tmp_path / "workspace", World(official_from_local=origin))
-    both = KaptureData(
-        sensors=drives.mapping.sensors,
-        rigs={"car": {"cam0": RigidTransform.identity()}},  # the exporter needs rigs
-        trajectories=drives.mapping.trajectories | drives.localized.trajectories,
-        records_camera=drives.mapping.records_camera | drives.localized.records_camera,
-    )
-    write_sensors(tmp_path / "both", both)
-    pairs = tmp_path / "pairs.txt"
-    pairs.write_text("".join(f"{r} {q}\n" for r, q in drives.pairs))
+    both, pairs, place = tmp_path / "both", tmp_path / "pairs.txt", tmp_path / "submission"
+    write_sensors(both, write_drives(tmp_path))
+    pairs.write_text("".join(f"{STAMPS[r]} {STAMPS[q]}\n" for r, q in PAIRS))
     export_4seasons_pairfile(
-        str(tmp_path / "both"), str(pairs), str(tmp_path / "theirs.txt"), heal_timestamps=False
+        str(both), str(pairs), str(tmp_path / "theirs.txt"), heal_timestamps=False
     )
-    place = tmp_path / "submission"
-    counts = write_submission(drives.result, place, tables=drives.tables, provenance={})
-    ours = np.loadtxt(place / "a_to_b.txt")
-    theirs = np.loadtxt(tmp_path / "theirs.txt")
-    assert ours.shape == theirs.shape == (4, 9)
-    np.testing.assert_array_equal(ours[:, :2], theirs[:, :2])
-    np.testing.assert_allclose(ours[:, 2:5], theirs[:, 2:5], atol=1e-9)
-    found, expected = (Rotation.from_quat(rows[:, 5:]) for rows in (ours, theirs))
-    assert (found * expected.inv()).magnitude().max() < 1e-12
-    expected = {"queries": 4, "scored": 5, "poses": 3, "missing": 2, "dummies": 2}
+    counts = write_submission(
+        tmp_path / "localized", place, tables=tmp_path / "megloc", provenance={}
+    )
+    expected = {"queries": 3, "scored": 3, "poses": 2, "missing": 1, "dummies": 1}
     assert counts == NONE | expected
-
-
-def test_mlad_rows_without_a_pose_are_listed_as_dummies(tmp_path: Path) -> None:
-    drives = Drives(tmp_path / "workspace", World(official_from_local=FAR))
-    place = tmp_path / "out" / "submission"
-    write_submission(drives.result, place, tables=drives.tables, provenance={})
-    rows = read_mlad_file(place / "a_to_b.txt")
-    assert [(row.reference, row.query) for row in rows] == drives.pairs
-    last = place / "a_to_b.txt"
-    assert last.read_text().splitlines()[3].split(" ", 2)[2] == "0.0 0.0 0.0 0.0 0.0 0.0 1.0"
-    assert (place / "sub" / "b.txt").read_text().endswith("0.0 0.0 0.0 0.0 0.0 0.0 1.0\n")
-    provenance = json.loads((tmp_path / "out" / "submission.json").read_text())
-    assert provenance["dummies"] == [
-        f"a_to_b.txt: {drives.rows[3].reference} {drives.rows[3].query}",
-        f"sub/b.txt: {drives.unposed.reference} {drives.unposed.query}",
-    ]
-    assert sorted(provenance["files"]) == ["a_to_b.txt", "sub/b.txt"]
+    ours, theirs = np.loadtxt(place / "sub" / "a.txt"), np.loadtxt(tmp_path / "theirs.txt")
+    np.testing.assert_array_equal(ours[:, :2], theirs[:, :2])
     # lengths are in official units
-    first = rows[1].query_from_reference
-    query, reference = drives.localized.poses(), drives.mapping.poses()
-    relative = matrix(query[drives.rows[1].query]) @ np.linalg.inv(
-        matrix(reference[drives.rows[1].reference])
-    )
-    assert first is not None
-    np.testing.assert_allclose(first.translation, 1.25 * relative[:3, 3], atol=1e-9)
-    write_relocalization(drives.tables, [])
-    with pytest.raises(DataError, match=r"relocalization\.csv: no pairs"):
-        write_submission(drives.result, tmp_path / "s", tables=drives.tables, provenance={})
+    np.testing.assert_allclose(ours[:, 2:5], 1.25 * theirs[:, 2:5], atol=1e-9)
+    rotations, expected_rotations = (Rotation.from_quat(rows[:, 5:]) for rows in (ours, theirs))
+    assert (rotations * expected_rotations.inv()).magnitude().max() < 1e-12
+    last = (place / "sub" / "a.txt").read_text().splitlines()[-1]
+    assert last == f"{STAMPS[3]} {STAMPS[6]} {DUMMY}"
+    provenance = json.loads((tmp_path / "submission.json").read_text())
+    dummy = f"sub/a.txt: ref/cam0/{STAMPS[3]}.png test/cam0/{STAMPS[6]}.png"
+    assert provenance["dummies"] == [dummy] and list(provenance["files"]) == ["sub/a.txt"]
 
 
 def test_provenance_has_fingerprints_options_and_versions(dataset: Dataset, tmp_path: Path) -> None:
