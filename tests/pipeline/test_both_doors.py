@@ -21,7 +21,6 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     read_match_counts,
-    read_refinement,
     read_status,
 )
 from megloc_kapture.pipeline.plan import Workspace
@@ -192,20 +191,6 @@ def test_the_same_poses_of_rigs(with_rig: Path, tmp_path: Path) -> None:
     left, right = (pose.cam_from_world for pose in poses[:2])
     expected = rigs["right"] @ left
     np.testing.assert_allclose(right.translation, expected.translation, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("by", ["icp", "rendering"])
-def test_the_same_refined_poses(with_depth: Path, tmp_path: Path, by: str) -> None:
-    sets = (*FEW, f'pose_refinement.by=["{by}"]', "localization.rank=perceptual")
-    workspace, localizer = both(with_depth, tmp_path / "workspace", *sets)
-    poses = same_poses(workspace, localizer)
-    final = workspace.folder("localized").read().poses()
-    stored = read_refinement(workspace.path("localized/refinement.csv"), final)
-    assert len(stored) == len(poses) == 4
-    for pose in poses:
-        ((live,), (step,)) = pose.refinements, stored[pose.name]
-        assert (step.method, step.reason) == (live.method, live.reason) and step.method == by
 
 
 @pytest.mark.parametrize("by", ["icp", pytest.param("rendering", marks=pytest.mark.slow)])

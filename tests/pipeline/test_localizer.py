@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tarfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -191,22 +189,6 @@ def test_many_queries_are_localized_lazily_and_in_order(
     for query, found in zip(queries, [first, *results], strict=True):
         assert errors(found, truth.cam_from_world(query.name))[0] < 0.02
     assert read == [query.name for query in queries]
-
-
-def test_features_of_a_map_in_a_tar(
-    localizer: Localizer, map_copy: Path, queries: list[Query]
-) -> None:
-    for kind, suffix in (("keypoints", ".kpt"), ("descriptors", ".desc")):
-        folder = map_copy / "reconstruction" / kind / "rootsift"
-        with tarfile.open(folder / f"{kind}.tar", "w") as tar:
-            for file in sorted(folder.glob(f"*{suffix}")):
-                tar.add(file, file.name)
-                file.unlink()
-    again = Localizer(KaptureMap.open(map_copy), options=few())
-    with ThreadPoolExecutor(2) as executor:
-        results = list(again.localize_many(queries, executor))
-    for query, found in zip(queries, results, strict=True):
-        assert same(found, localizer.localize_query(query))
 
 
 @pytest.mark.slow

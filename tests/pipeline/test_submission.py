@@ -406,18 +406,6 @@ def test_labels_name_features_that_differ_from_the_preset(tmp_path: Path) -> Non
     )
 
 
-def test_default_workspaces_are_named_by_dataset_and_preset(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    options = PipelineOptions()
-    for root in (Path("house"), tmp_path / "house", Path("house/../house/")):
-        place = Run(DatasetChoice("kapture", root), "modern", options).default_workspace
-        assert place == Path("runs/kapture-house-modern")
-    rendered = Run(DatasetChoice("synthetic-aachen", None), "classic", options)
-    assert rendered.default_workspace == Path("runs/synthetic-aachen-classic")
-
-
 NAME = "Aachen_v1_1_eval_megloc-classic"
 
 

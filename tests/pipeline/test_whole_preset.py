@@ -13,7 +13,6 @@ import pytest
 from megloc_kapture.cli.main import main
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.io.weights import find_weights, read_weights, registry
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from whole_preset import (  # noqa: E402
@@ -29,7 +28,6 @@ from whole_preset_weights import Sizes, write_random_weights  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-KEYS = Path(__file__).parents[1] / "nets" / "keys"
 SCENE = Scene(
     RANDOM_SCENE.world.model_copy(
         update={"num_places": 1, "day_queries": 2, "width": 192, "height": 144, "supersampling": 1}
@@ -94,26 +92,6 @@ def workspace(added: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run; read only."""
     wiring = Wiring("random", SCENE, WIRINGS["random"].options)
     return run(wiring, tmp_path_factory.mktemp("whole"), megloc, changed())
-
-
-def keys(file: str) -> set[str]:
-    return {row.split()[0] for row in (KEYS / file).read_text().splitlines()}
-
-
-def test_random_weights_have_published_names_and_keys(made: dict[str, Path], added: Path) -> None:
-    found = {name: set(read_weights(find_weights(name))) for name in made}
-    for name, path in made.items():
-        known = {Path(file.name).name for file in registry()[name].files if not file.convert}
-        assert path.name in known | {registry()[name].converted}
-        assert find_weights(name).path.is_relative_to(added / "unverified")
-    assert found["superpoint_v1"] == keys("superpoint.txt")
-    assert found["superglue_outdoor"] == found["superglue_indoor"] == keys("superglue.txt")
-    assert found["openibl"] == keys("openibl.txt")
-    assert found["netvlad-pitts30k"] == keys("openibl.txt") | {"average_image"}
-    assert found["deeplabv3plus-resnet101"] == keys("deeplabv3plus-resnet101.txt")
-    whitening = {key for key in found["apgem-resnet101-lm18"] if key.startswith("pca.")}
-    assert "pca.Landmarks_clean.components" in whitening and len(whitening) == 4
-    assert keys("apgem-resnet101.txt") <= found["apgem-resnet101-lm18"]
 
 
 def test_kapture_reads_the_output_of_every_stage_and_network(workspace: Path) -> None:

@@ -72,21 +72,15 @@ def test_images_are_described_alone_or_in_batches(
     assert folder_bytes(tmp_path / "threads" / place) == folder_bytes(tmp_path / place)
 
 
-@pytest.mark.parametrize(
-    ("returned", "message"),
-    [
-        ([1.0, 0.0], "got list, expected float32"),
-        (np.array([3, 4], np.float32), "a vector of length 5, expected 1"),
-    ],
-)
-def test_wrong_vectors_of_a_plugin_are_refused(returned: Any, message: str) -> None:
+def test_wrong_vectors_of_a_plugin_are_refused() -> None:
     class Wrong:
         name = "wrong"
 
         def describe(self, image: np.ndarray) -> Any:
-            return returned
+            return np.array([3, 4], np.float32)
 
-    with pytest.raises(PluginError, match=f"'wrong' on image a.png: .*{message}"):
+    message = "'wrong' on image a.png: .*a vector of length 5, expected 1"
+    with pytest.raises(PluginError, match=message):
         describe_images(Wrong(), [np.zeros((4, 4, 3), np.uint8)], ["a.png"])
 
 

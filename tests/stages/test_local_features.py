@@ -115,23 +115,12 @@ class Returning:
         return self.value
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        (None, "got NoneType, expected LocalFeatures"),
-        (features(keypoints_px=np.ones((3, 2))), r"got float64 \(3, 2\), expected float32"),
-        (
-            features(descriptors=np.ones((2, 4), np.float32)),
-            r"got float32 \(2, 4\), expected .*3, N",
-        ),
-    ],
-)
-def test_wrong_features_of_a_plugin_are_refused(
-    small_kapture: Any, tmp_path: Path, value: Any, message: str
-) -> None:
+def test_wrong_features_of_a_plugin_are_refused(small_kapture: Any, tmp_path: Path) -> None:
     folder = small_kapture({"a.png": noise()})
-    with pytest.raises(PluginError, match=rf"plugin 'returning' on image a\.png: .*{message}"):
-        extract_local_features([folder], Returning(value), tmp_path / "features")
+    wrong = Returning(features(descriptors=np.ones((2, 4), np.float32)))
+    message = r"plugin 'returning' on image a\.png: .*got float32 \(2, 4\), expected .*3, N"
+    with pytest.raises(PluginError, match=message):
+        extract_local_features([folder], wrong, tmp_path / "features")
 
 
 def test_dtypes_and_columns_of_a_plugin_are_kept(small_kapture: Any, tmp_path: Path) -> None:

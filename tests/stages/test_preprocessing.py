@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, PluginError
+from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.images import (
     image_size,
@@ -307,20 +307,6 @@ def test_only_calibrated_cameras_are_undistorted(street: KaptureFolder, tmp_path
     write_sensors(street.root, data)
     with pytest.raises(DataError, match="'side' of image 'side/0.jpg': camera is not calibrated"):
         run(KaptureFolder(street.root), tmp_path / "new", undistort=True)
-
-
-@pytest.mark.parametrize(
-    ("labels", "message"),
-    [
-        (np.zeros((4, 4), np.uint8), r"got uint8 \(4, 4\), expected uint8 \(200, 320\)"),
-        (np.full((200, 320), 3, np.uint8), "label 3, but there are 3 classes"),
-    ],
-)
-def test_wrong_labels_of_a_segmenter_are_refused(
-    street: KaptureFolder, tmp_path: Path, labels: Any, message: str
-) -> None:
-    with pytest.raises(PluginError, match=rf"'halves' on image front/0\.png: .*{message}"):
-        run(street, tmp_path / "new", segmenter=Halves(labels))
 
 
 def test_unknown_classes_are_refused(street: KaptureFolder, tmp_path: Path) -> None:

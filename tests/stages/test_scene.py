@@ -23,7 +23,6 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.stages.scene import (
-    depth_records,
     index_map,
     open_index,
     poses_through_rig,
@@ -87,18 +86,6 @@ def test_nested_rigs_equal_one_rig(data: KaptureData) -> None:
     assert found.keys() == expected.keys()
     for image, (_, pose) in found.items():
         np.testing.assert_allclose(pose.matrix(), expected[image][1].matrix(), atol=1e-12)
-    data.sensors["depth"] = replace(CAMERA, sensor_type="depth")
-    data.rigs["car"]["depth"] = random_pose(7)
-    data.records_depth[1, "depth"] = "1.depth"
-    of_image = depth_records(data)
-    assert of_image.keys() == {"left/1.jpg", "rear/1.jpg", "right/1.jpg"}
-    to_depth = data.rigs["front"]["left"] @ front @ random_pose(7).inverse()
-    found_depth = of_image["left/1.jpg"].image_from_depth.matrix()
-    np.testing.assert_allclose(found_depth, to_depth.matrix(), atol=1e-12)
-    data.rigs["front"]["car"] = front
-    data.rigs["roof"] = {"car": front}
-    with pytest.raises(DataError, match="contains itself"):
-        query_units(data, rigs=True)
 
 
 def test_the_camera_with_most_inliers_gives_the_pose(data: KaptureData) -> None:
