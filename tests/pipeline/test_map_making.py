@@ -16,19 +16,17 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import megloc_kapture as megloc
-from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
-from megloc_kapture.io.dataset_tables import read_unreadable, read_world
+from megloc_kapture.io.dataset_tables import read_unreadable
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.map_making import (
     colmap_maps_folder,
-    import_colmap,
     kapture_of,
     options_of_photographs,
 )
-from megloc_kapture.values import Camera, Pose, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 from tests.rendering import corner
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -79,27 +77,6 @@ def test_a_changed_model_is_imported_again(workspace: Path) -> None:
     kapture_of(workspace)
     assert link.resolve() == (workspace / "sparse" / "images").resolve()
     assert [path.name for path in colmap_maps_folder().iterdir()] == [first.name]
-
-
-@pytest.mark.slow
-def test_a_model_without_points_is_mapped_with_its_poses(
-    workspace: Path, scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    model = pycolmap.Reconstruction(workspace / "sparse" / "0")
-    model.delete_all_points2D_and_points3D()
-    model.write_binary(workspace / "sparse" / "0")
-    (tmp_path / "map").mkdir()
-    counts = import_colmap(find_colmap(workspace), tmp_path / "map")
-    assert "the model has no points; its images are mapped again with its poses" in caplog.text
-    folder = KaptureFolder(tmp_path / "map")
-    folder.validate(deep=True)
-    assert counts["points"] == len(folder.points3d()) > 100
-    assert sorted(path.name for path in folder.root.iterdir()) == [
-        *("megloc", "reconstruction", "sensors")
-    ]
-    results = megloc.open_map(folder.root).localize(scene / "query")
-    found = megloc.evaluate(results, truth=scene / "query_gt").row()
-    assert found.num_localized == 4 and (found.median_position_m or 1) < 0.01
 
 
 def test_a_damaged_model_leaves_no_map(
@@ -200,23 +177,6 @@ def test_poses_and_focal_length_are_accurate(room: Path, made: megloc.Map) -> No
         assert Rotation.from_matrix(ours @ true.T).magnitude() < np.radians(1.0)
 
 
-def test_maps_without_scale_are_used_except_for_limits_in_metres(
-    room: Path, made: megloc.Map, tmp_path: Path
-) -> None:
-    workspace = room / "workspace"
-    opened = megloc.open_map(workspace)
-    results = opened.localize([room / "photos" / "0003.jpg", room / "photos" / "0007.jpg"])
-    assert all(isinstance(results[name], Pose) for name in ("0003.jpg", "0007.jpg"))
-    results.save(tmp_path / "localized")
-    assert read_world(tmp_path / "localized" / "megloc").unit == "units"
-    opened.view(tmp_path / "view.html", tmp_path / "localized")
-    megloc.export("colmap", tmp_path / "model", map=workspace)
-    assert len(pycolmap.Reconstruction(str(tmp_path / "model")).images) == 11
-    KaptureFolder(workspace / "map").validate(deep=True)
-    with pytest.raises(OptionError, match=r"rendering: its limits are in metres, and the"):
-        made.localize(room / "photos" / "0003.jpg", refine="rendering")
-
-
 def test_a_distance_gives_the_scale(room: Path, tmp_path: Path) -> None:
     truth = true_poses(room / "mapping", room / "query_gt")
     photos = put(tmp_path / "photos", images_of(room)[:5])
@@ -265,13 +225,6 @@ def test_photographs_of_two_scenes_are_two_models(
     assert reasons.pop("broken.jpg").startswith("cannot be read")
     assert sorted(reasons) == [f"other_{image.name}" for image in others]
     assert all(reason.startswith("model 2, of 4 photographs") for reason in reasons.values())
-
-
-@pytest.mark.usefixtures("made")
-def test_a_map_of_other_photographs_is_not_replaced(room: Path, tmp_path: Path) -> None:
-    others = put(tmp_path / "others", images_of(room)[:4])
-    with pytest.raises(OptionError, match="was made of .*photos; give another folder"):
-        megloc.map_photographs(others, workspace=room / "workspace", **FEW)
 
 
 def test_photographs_without_a_common_scene_are_refused(room: Path, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from kapture_forms import aachen_with_kapture
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.errors import MeglocError, OptionError
-from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.pipeline.datasets import DatasetChoice, choose_dataset, find_benchmark
 from megloc_kapture.pipeline.evaluation_plan import (
     Run,
@@ -20,7 +19,7 @@ from megloc_kapture.pipeline.evaluation_plan import (
     explained,
     plan_evaluation,
 )
-from megloc_kapture.pipeline.presets import check_weights, options_of_preset
+from megloc_kapture.pipeline.presets import options_of_preset
 
 MISSING = "3D-models/aachen_v_1_1/points3D.txt: missing"
 
@@ -72,28 +71,6 @@ def test_data_without_a_model_have_no_pairs_by_covisibility(
         typed = ['mapping_pairs.by=["covisibility"]']
         with pytest.raises(MeglocError, match=error):
             plan_evaluation(choose_run("aachen", root, preset="megloc", assignments=typed))
-
-
-@pytest.mark.parametrize("dataset", ["aachen", "inloc"])
-def test_all_missing_weights_are_named_together(
-    dataset: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path))
-    with pytest.raises(MissingWeightsError) as error:
-        check_weights(run_of(dataset, "megloc").options)
-    needed = ["superpoint_v1", "aslfeat", "netvlad-pitts30k", "delg-r101-gldv2clean", "openibl"]
-    needed += ["apgem-resnet101-lm18"]
-    if dataset == "inloc":
-        needed += ["superglue_indoor", "lpips-trunk-alex", "lpips-alex"]
-    else:
-        needed += ["superglue_outdoor", "deeplabv3plus-resnet101"]
-    *lines, together = str(error.value).splitlines()
-    if dataset == "inloc":  # with another matcher than the preset
-        lines.append(together)
-    else:
-        assert together.endswith("megloc weights fetch --preset megloc --accept-licence")
-    assert sorted(line.split()[2] for line in lines) == sorted(needed)
-    assert all("megloc weights " in line or "convert_weights.py" in line for line in lines)
 
 
 def test_explain_runs_nothing_and_needs_no_data(

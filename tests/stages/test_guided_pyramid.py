@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Collection
 from dataclasses import replace
 from itertools import combinations, product
@@ -12,8 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from kapture.io.csv import kapture_from_dir
-from kapture.io.features import image_keypoints_from_file
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
@@ -250,23 +247,6 @@ def test_features_of_the_base_type_keep_their_rows(scene: Scene, kind: str) -> N
         # mode all keeps the earlier matches
         np.testing.assert_array_equal(more[: len(indices)], indices)
         np.testing.assert_array_equal(more_scores[: len(indices)], scores)
-
-
-def test_kapture_reads_the_pyramid_type(scene: Scene, tmp_path: Path) -> None:
-    name = "upright-pyramid"
-    shutil.copytree(scene.root / "mapping" / "sensors", tmp_path / "sensors")
-    for kind in ("keypoints", "descriptors", "matches"):
-        source = scene.root / "mapping_all" / "local_features" / name / kind
-        shutil.copytree(source, tmp_path / "reconstruction" / kind / name)
-    theirs = kapture_from_dir(str(tmp_path))
-    keypoints = theirs.keypoints[name]
-    assert set(keypoints) == set(MAP_IMAGES)
-    assert theirs.descriptors[name].keypoints_type == name
-    assert set(theirs.matches[name]) == set(combinations(MAP_IMAGES, 2))
-    for image in MAP_IMAGES:
-        file = str(tmp_path / "reconstruction" / "keypoints" / name / f"{image}.kpt")
-        read = image_keypoints_from_file(file, keypoints.dtype, keypoints.dsize)
-        np.testing.assert_array_equal(read, scene.larger("mapping").keypoints(name).read(image))
 
 
 def test_masks_apply_to_variants_and_small_variants_are_skipped(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -216,17 +215,6 @@ def test_masks_are_8_bit_and_obeyed_by_features(street: KaptureFolder, tmp_path:
     seen = KaptureFolder(new.root, features_dirs=[tmp_path / "features"]).keypoints("rootsift")
     assert seen.read("front/0.png")[:, 0].min() >= 80
     assert seen.read("side/0.jpg")[:, 0].min() < 80
-
-
-def test_labels_of_the_segmenter_are_written(street: KaptureFolder, tmp_path: Path) -> None:
-    new, _ = run(street, tmp_path / "new", {"dynamic": ("sky",)}, segmenter=Halves())
-    folder = new.root / "sensors" / "classes"
-    labels = cv2.imread(str(folder / "side/1.jpg.png"), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(labels, Halves().segment(cloudy(0)))
-    mask = mask_of(new, "side/1.jpg")
-    np.testing.assert_array_equal(mask, labels != 1)
-    named = json.loads((folder / "classes.json").read_text())
-    assert tuple(named["classes"]) == Halves.classes and named["dynamic"] == ["sky"]
 
 
 def test_the_ego_vehicle_region_is_found_with_map_images(

@@ -154,20 +154,6 @@ def test_files_of_a_shared_index_are_removed() -> None:
     assert found == index.shared_points(NAMES).tolist()
 
 
-def test_the_index_is_of_one_keypoints_type(world: Any) -> None:
-    index = index_map(world.map(), "rootsift")
-    observations = world.map().observations()["rootsift"]
-    assert len(index.keypoint_ids) == len(observations.point_ids)
-    rows = observations.image_ids == 2
-    ascending = np.argsort(observations.keypoint_ids[rows], kind="stable")
-    keypoints, points = index.observed("right/2.png")
-    np.testing.assert_array_equal(keypoints, observations.keypoint_ids[rows][ascending])
-    np.testing.assert_array_equal(points, observations.point_ids[rows][ascending])
-    assert index.covariances is None
-    with pytest.raises(DataError, match="no observations of type 'other'"):
-        index_map(world.map(), "other")
-
-
 def test_a_map_without_points_has_an_empty_index(world: Any, tmp_path: Path) -> None:
     whole = world.map()
     root = Path(shutil.copytree(whole.root, tmp_path / "map", symlinks=True))
@@ -176,6 +162,8 @@ def test_a_map_without_points_has_an_empty_index(world: Any, tmp_path: Path) -> 
     empty = KaptureFolder(root, features_dirs=whole.features_dirs)
     index = index_map(empty, "rootsift")
     assert index.xyz.shape == (0, 3) and not index.row_of_image
+    with pytest.raises(DataError, match="no observations of type 'other'"):
+        index_map(world.map(), "other")
 
 
 def test_covariances_of_the_map_are_read(world: Any, tmp_path: Path) -> None:

@@ -7,9 +7,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import pytest
-
-from megloc_kapture.errors import DataError
 from megloc_kapture.stages.work import FolderSpec, ordered_map
 
 
@@ -48,20 +45,6 @@ def test_at_most_a_window_of_items_is_submitted() -> None:
         results = ordered_map(int, items(), executor, window=5)
         for count, _ in enumerate(results, start=1):
             assert taken <= count + 5
-
-
-def test_errors_of_workers_are_raised() -> None:
-    def fail_at_three(value: int) -> int:
-        if value == 3:
-            raise DataError("the third is broken")
-        return value * value
-
-    with ThreadPoolExecutor(2) as executor:
-        seen = []
-        with pytest.raises(DataError, match="the third is broken"):
-            for value in ordered_map(fail_at_three, range(50), executor, window=4):
-                seen.append(value)
-    assert seen == [0, 1, 4]
 
 
 def test_a_folder_is_opened_once_in_a_run(world: Any) -> None:
