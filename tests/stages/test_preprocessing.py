@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
+from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, PluginError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.images import (
     image_size,
@@ -295,6 +295,12 @@ def test_only_calibrated_cameras_are_undistorted(street: KaptureFolder, tmp_path
     write_sensors(street.root, data)
     with pytest.raises(DataError, match="'side' of image 'side/0.jpg': camera is not calibrated"):
         run(KaptureFolder(street.root), tmp_path / "new", undistort=True)
+
+
+def test_unknown_labels_of_a_segmenter_are_refused(street: KaptureFolder, tmp_path: Path) -> None:
+    segmenter = Halves(np.full((200, 320), 3, np.uint8))
+    with pytest.raises(PluginError, match="'halves' on image front/0.png: .*label 3"):
+        run(street, tmp_path / "new", segmenter=segmenter)
 
 
 def test_unknown_classes_are_refused(street: KaptureFolder, tmp_path: Path) -> None:
