@@ -49,12 +49,12 @@ class Step(Stage):
 
 
 @dataclass
-class Kitchen:
+class Plan:
     """A plan of three stages; each writes its input and its letter."""
 
     workspace: Workspace
     options: dict[str, dict[str, Any]] = field(default_factory=lambda: {"a": {}, "b": {}, "c": {}})
-    external: dict[str, str] = field(default_factory=lambda: {"flour": "1"})
+    external: dict[str, str] = field(default_factory=lambda: {"data": "1"})
     version: int = 1
     log: list[str] = field(default_factory=list)
 
@@ -79,130 +79,136 @@ class Kitchen:
             if command := self.options[name].get("killed"):
                 assert subprocess.run([*command, str(place)], check=False).returncode == 9
                 assert len(list(place.parent.iterdir())) == 2
-            if self.options[name].get("burns"):
-                raise DataError("burnt")
+            if self.options[name].get("fails"):
+                raise DataError("it fails")
             return {"letters": float(len(text) + 1)}
 
         return run
 
-    def cook(self, **how: Any) -> list[StageReport]:
+    def run(self, **how: Any) -> list[StageReport]:
         self.log.clear()
         return run_plan(self.stages(), self.workspace, **how)
 
-    def meal(self) -> str:
+    def result(self) -> str:
         return self.workspace.path("c.txt").read_text()
 
 
 @pytest.fixture
-def kitchen(tmp_path: Path) -> Kitchen:
-    return Kitchen(Workspace(tmp_path / "kitchen"))
+def plan(tmp_path: Path) -> Plan:
+    return Plan(Workspace(tmp_path / "plan"))
 
 
-def test_all_stages_run_once(kitchen: Kitchen) -> None:
-    reports = kitchen.cook()
+def test_all_stages_run_once(plan: Plan) -> None:
+    reports = plan.run()
     assert [(r.name, r.state, r.why) for r in reports] == [
         (name, "run", "not done yet") for name in "abc"
     ]
     assert [r.counts["letters"] for r in reports] == [1.0, 2.0, 3.0]
-    assert kitchen.meal() == "abc"
+    assert plan.result() == "abc"
     assert not all_kept(reports)
-    again = kitchen.cook()
-    assert kitchen.log == [] and all_kept(again)
+    again = plan.run()
+    assert plan.log == [] and all_kept(again)
     assert [r.counts for r in again] == [r.counts for r in reports]
 
 
-CHANGES: dict[str, tuple[Callable[[Kitchen], Any], list[str]]] = {
+CHANGES: dict[str, tuple[Callable[[Plan], Any], list[str]]] = {
     "an option": (
-        lambda k: k.options["b"].update(extra="!"),
+        lambda plan: plan.options["b"].update(extra="!"),
         ["", "options changed: extra", "b changed"],
     ),
     "nested options": (
-        lambda k: k.options["a"].update(deep={"x": 2, "y": [(0.5, None)]}, new=1),
+        lambda plan: plan.options["a"].update(deep={"x": 2, "y": [(0.5, None)]}, new=1),
         ["options changed: deep.x, new", "a changed", "a changed"],
     ),
     "an input": (
-        lambda k: k.external.update(flour="2"),
-        ["flour changed", "a changed", "a changed"],
+        lambda plan: plan.external.update(data="2"),
+        ["data changed", "a changed", "a changed"],
     ),
     "a version": (
-        lambda k: setattr(k, "version", 2),
+        lambda plan: setattr(plan, "version", 2),
         ["a newer version of the stage", "a changed", "a changed"],
     ),
-    "a removed output": (lambda k: k.workspace.path("a.txt").unlink(), ["a.txt is gone", "", ""]),
-    "no manifest": (lambda k: k.workspace.manifest_path("b").unlink(), ["", "not done yet", ""]),
+    "a removed output": (
+        lambda plan: plan.workspace.path("a.txt").unlink(),
+        ["a.txt is gone", "", ""],
+    ),
+    "no manifest": (
+        lambda plan: plan.workspace.manifest_path("b").unlink(),
+        ["", "not done yet", ""],
+    ),
 }
 
 
 @pytest.mark.parametrize(("change", "why"), CHANGES.values(), ids=CHANGES)
 def test_changed_stages_run_again(
-    kitchen: Kitchen, change: Callable[[Kitchen], Any], why: list[str]
+    plan: Plan, change: Callable[[Plan], Any], why: list[str]
 ) -> None:
-    kitchen.options["a"] = {"pair": (1, 2), "deep": {"x": 1, "y": [(0.5, None)]}}
-    kitchen.cook()
-    change(kitchen)
-    reports = kitchen.cook()
+    plan.options["a"] = {"pair": (1, 2), "deep": {"x": 1, "y": [(0.5, None)]}}
+    plan.run()
+    change(plan)
+    reports = plan.run()
     assert [report.why for report in reports] == why
-    assert kitchen.log == [name for name, reason in zip("abc", why, strict=True) if reason]
-    assert kitchen.meal() == f"ab{kitchen.options['b'].get('extra', '')}c"
-    assert all_kept(kitchen.cook())
+    assert plan.log == [name for name, reason in zip("abc", why, strict=True) if reason]
+    assert plan.result() == f"ab{plan.options['b'].get('extra', '')}c"
+    assert all_kept(plan.run())
 
 
-def test_an_output_that_is_no_longer_written_is_removed(kitchen: Kitchen) -> None:
-    kitchen.options["b"] = {"csv": True}
-    kitchen.cook()
-    assert kitchen.workspace.path("b.csv").is_file()
-    assert all_kept(kitchen.cook())
-    kitchen.options["b"] = {}
-    kitchen.cook()
-    assert not kitchen.workspace.path("b.csv").exists()
-    assert all_kept(kitchen.cook())
+def test_an_output_that_is_no_longer_written_is_removed(plan: Plan) -> None:
+    plan.options["b"] = {"csv": True}
+    plan.run()
+    assert plan.workspace.path("b.csv").is_file()
+    assert all_kept(plan.run())
+    plan.options["b"] = {}
+    plan.run()
+    assert not plan.workspace.path("b.csv").exists()
+    assert all_kept(plan.run())
 
 
 def test_an_output_of_another_stage_under_other_options_is_made_again(tmp_path: Path) -> None:
-    workspace, output = Workspace(tmp_path / "w"), tmp_path / "w" / "soup.txt"
+    workspace, output = Workspace(tmp_path / "w"), tmp_path / "w" / "images.txt"
 
     def write(name: str, text: str) -> Callable[[Path], Mapping[str, float]]:
         return lambda out: {"letters": float((out / name).write_text(text))}
 
-    def cook(seasoned: bool) -> list[StageReport]:
-        """Write the soup, or a plain soup first and the seasoned one from it."""
-        if not seasoned:
-            return run_plan([Step("cook", (), ("soup.txt",), write("soup.txt", "soup"))], workspace)
-        plain = Step("cook", (), ("plain.txt",), write("plain.txt", "soup"))
-        salted = write("soup.txt", "soup, salted")
-        season = Step("season", ("plain.txt",), ("soup.txt",), salted)
-        return run_plan([plain, season], workspace)
+    def run(resized: bool) -> list[StageReport]:
+        """Import images, or import them to another file and resize them."""
+        name = "imported.txt" if resized else "images.txt"
+        stages = [Step("import", (), (name,), write(name, "large"))]
+        if resized:
+            resize = write("images.txt", "small")
+            stages.append(Step("resize", ("imported.txt",), ("images.txt",), resize))
+        return run_plan(stages, workspace)
 
-    for seasoned in (False, True, False, True):
-        assert not all_kept(cook(seasoned))
-        assert output.read_text() == ("soup, salted" if seasoned else "soup")
-        assert workspace.path("plain.txt").exists() == seasoned
-    assert all_kept(cook(seasoned=True))
-    assert cook(seasoned=False)[0].why == "plain.txt is no longer written"
-    assert not workspace.manifest_path("season").exists()
-
-
-def test_a_failed_stage_leaves_the_old_output(kitchen: Kitchen) -> None:
-    kitchen.cook()
-    kitchen.options["b"] = {"extra": "!", "burns": True}
-    with pytest.raises(DataError, match="burnt"):
-        kitchen.cook()
-    assert kitchen.workspace.path("b/b.txt").read_text() == "ab"
-    assert list(kitchen.workspace.path(".partial").iterdir()) == []
-    kitchen.options["b"] = {}
-    assert all_kept(kitchen.cook())
+    for resized in (False, True, False, True):
+        assert not all_kept(run(resized))
+        assert output.read_text() == ("small" if resized else "large")
+        assert workspace.path("imported.txt").exists() == resized
+    assert all_kept(run(resized=True))
+    assert run(resized=False)[0].why == "imported.txt is no longer written"
+    assert not workspace.manifest_path("resize").exists()
 
 
-def test_files_of_killed_runs_and_workers_are_not_published(kitchen: Kitchen) -> None:
-    rest = kitchen.workspace.path(".partial/b/b")
+def test_a_failed_stage_leaves_the_old_output(plan: Plan) -> None:
+    plan.run()
+    plan.options["b"] = {"extra": "!", "fails": True}
+    with pytest.raises(DataError, match="it fails"):
+        plan.run()
+    assert plan.workspace.path("b/b.txt").read_text() == "ab"
+    assert list(plan.workspace.path(".partial").iterdir()) == []
+    plan.options["b"] = {}
+    assert all_kept(plan.run())
+
+
+def test_files_of_killed_runs_and_workers_are_not_published(plan: Plan) -> None:
+    rest = plan.workspace.path(".partial/b/b")
     rest.mkdir(parents=True)
     (rest / "rest.txt").write_text("half")
     dying = "from megloc_kapture.io.files import *; import os, sys\n"
     dying += "with atomic_write(sys.argv[1]) as file: file.write(b'half'); os._exit(9)"
-    kitchen.options["b"]["killed"] = [sys.executable, "-c", dying]
+    plan.options["b"]["killed"] = [sys.executable, "-c", dying]
     with ThreadPoolExecutor(1) as executor:
-        kitchen.cook(work=Work(executor))
-    assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
+        plan.run(work=Work(executor))
+    assert [p.name for p in plan.workspace.path("b").iterdir()] == ["b.txt"]
 
 
 def test_a_workspace_keeps_the_data_of_its_root(tmp_path: Path) -> None:
@@ -230,48 +236,48 @@ def test_a_workspace_keeps_the_data_of_its_root(tmp_path: Path) -> None:
     assert import_from(tmp_path / "moved") == str(tmp_path / "moved")
 
 
-def test_first_and_last_stage(kitchen: Kitchen) -> None:
+def test_first_and_last_stage(plan: Plan) -> None:
     with pytest.raises(OptionError, match="--from b needs stage a, which has not run"):
-        kitchen.cook(first="b")
-    assert [r.name for r in kitchen.cook(last="a")] == ["a"]
-    reports = kitchen.cook(first="b")
+        plan.run(first="b")
+    assert [r.name for r in plan.run(last="a")] == ["a"]
+    reports = plan.run(first="b")
     assert [(r.name, r.state) for r in reports] == [("a", "skipped"), ("b", "run"), ("c", "run")]
     assert [r.why for r in reports] == ["", "asked for", "follows b"]
-    reports = kitchen.cook(first="b", last="b")
+    reports = plan.run(first="b", last="b")
     assert [(r.state, r.why) for r in reports] == [("skipped", ""), ("run", "asked for")]
-    assert [r.why for r in kitchen.cook()] == ["", "", "not done yet"]
+    assert [r.why for r in plan.run()] == ["", "", "not done yet"]
     with pytest.raises(OptionError, match="--until a comes before --from c"):
-        kitchen.cook(first="c", last="a")
+        plan.run(first="c", last="a")
 
 
-def test_stages_before_the_first_are_not_checked(kitchen: Kitchen) -> None:
-    kitchen.cook()
-    kitchen.options["a"] = {"extra": "?"}
-    kitchen.cook(first="c")
-    assert kitchen.log == ["c"] and kitchen.meal() == "abc"
-    kitchen.cook()
-    assert kitchen.log == ["a", "b", "c"] and kitchen.meal() == "a?bc"
+def test_stages_before_the_first_are_not_checked(plan: Plan) -> None:
+    plan.run()
+    plan.options["a"] = {"extra": "?"}
+    plan.run(first="c")
+    assert plan.log == ["c"] and plan.result() == "abc"
+    plan.run()
+    assert plan.log == ["a", "b", "c"] and plan.result() == "a?bc"
     # a stage that does not read the new output is kept
-    stages = kitchen.stages()
+    stages = plan.stages()
     stages[2].reads = ("a.txt",)
-    run_plan(stages, kitchen.workspace)
-    reports = run_plan(stages, kitchen.workspace, first="b")
+    run_plan(stages, plan.workspace)
+    reports = run_plan(stages, plan.workspace, first="b")
     assert [r.state for r in reports] == ["skipped", "run", "kept"]
 
 
-def test_a_dry_run_runs_nothing(kitchen: Kitchen) -> None:
+def test_a_dry_run_runs_nothing(plan: Plan) -> None:
     lines: list[str] = []
-    reports = kitchen.cook(dry_run=True, say=lines.append)
+    reports = plan.run(dry_run=True, say=lines.append)
     assert [r.state for r in reports] == ["pending"] * 3
     assert lines == [f"{name}: would run (not done yet)" for name in "abc"]
-    kitchen.cook()
-    kitchen.options["b"] = {"extra": "!"}
-    reports = kitchen.cook(dry_run=True)
+    plan.run()
+    plan.options["b"] = {"extra": "!"}
+    reports = plan.run(dry_run=True)
     assert [r.state for r in reports] == ["kept", "pending", "pending"]
-    reports = kitchen.cook(dry_run=True, first="b")
-    assert kitchen.log == []
-    kitchen.options["b"] = {}
-    assert all_kept(kitchen.cook())
+    reports = plan.run(dry_run=True, first="b")
+    assert plan.log == []
+    plan.options["b"] = {}
+    assert all_kept(plan.run())
 
 
 @pytest.mark.parametrize(
