@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, RigidTransform
@@ -28,3 +29,9 @@ def one_camera(
         if poses is not None and name in poses:
             data.trajectories[timestamp, "cam"] = poses[name]
     return data
+
+
+def folder_bytes(folder: Path) -> dict[str, bytes]:
+    """Return the content of every file below a folder, by relative path."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}

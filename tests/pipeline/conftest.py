@@ -1,4 +1,4 @@
-"""Our own map of the small scene, shared by the tests of what localizes in it."""
+"""Scenes, and a map of the small scene that the tests share."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from tests.pipeline.runs import evaluated
 
 @pytest.fixture(scope="session")
 def fountain(shared_data: Path) -> Path:
-    """A real scene: mapping/, query/ and query_gt/; not to be written into."""
+    """A real scene: mapping/, query/ and query_gt/; read only."""
     return shared_data / "scenes" / "fountain_p11"
 
 
 @pytest.fixture(scope="session")
 def virtual_gallery(shared_data: Path) -> Path:
-    """The foreign map: map/, query/ and query_gt/; not to be written into."""
+    """The foreign map: map/, query/ and query_gt/; read only."""
     return shared_data / "foreign_maps" / "virtual_gallery"
 
 
 @pytest.fixture(scope="session")
 def workspace(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A workspace with our map of the scene, few keypoints per image; not to be written into."""
+    """A workspace with our map of the scene and few keypoints; read only."""
     few = options_of_preset(assignments=["local_features.options.max_keypoints=800"])
     root = tmp_path_factory.mktemp("map") / "workspace"
     return evaluated(root, scene, few, last="map").root
@@ -33,5 +33,5 @@ def workspace(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def map_copy(workspace: Path, tmp_path: Path) -> Path:
-    """A copy of our map, its images links, to be changed."""
+    """A copy of our map that a test may change; its images are links."""
     return Path(shutil.copytree(workspace / "map", tmp_path / "map", symlinks=True))

@@ -18,7 +18,7 @@ from megloc_kapture.pipeline.datasets import (
     find_benchmark,
     twin_of,
 )
-from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation, recall_rows
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.plan import Manifest, StageReport, Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -36,7 +36,7 @@ def run_in(
     benchmark: BenchmarkFile | None = None,
     **how: Any,
 ) -> dict[str, StageReport]:
-    """Run the stages in a workspace, of a scene or a dataset; their reports by name."""
+    """Run the stages of a scene or a dataset; return their reports by name."""
     chosen = choose_dataset("kapture", source) if isinstance(source, Path) else source
     run = Run(chosen, "classic", options, benchmark or BenchmarkFile(dataset=KAPTURE))
     with workspace.lock(), single_threaded(), open_executor("processes", workers) as executor:
@@ -47,7 +47,7 @@ def run_in(
 def evaluated(
     root: Path, source: Path | DatasetChoice, options: PipelineOptions, **how: Any
 ) -> Workspace:
-    """A new workspace in which the stages have run."""
+    """Run the stages in a new workspace."""
     workspace = Workspace(root)
     run_in(workspace, source, options, **how)
     return workspace
@@ -56,7 +56,7 @@ def evaluated(
 def run_twin(
     workspace: Workspace, name: str, world: dict[str, Any], changes: Sequence[str] = ()
 ) -> dict[str, StageReport]:
-    """Run a small twin of a dataset by the dataset's own benchmark file, in two processes."""
+    """Run a small twin of a dataset with its benchmark file, in two processes."""
     dataset = f"{TWIN_PREFIX}{name}"
     benchmark = find_benchmark(dataset)
     source = choose_dataset(dataset, None, import_options=benchmark.import_options)
@@ -66,13 +66,8 @@ def run_twin(
     return run_in(workspace, source, options, workers=2, benchmark=benchmark)
 
 
-def recall(workspace: Workspace, name: str = "all") -> list[float]:
-    """The shares of queries at each threshold."""
-    return [at["recall"] for at in recall_rows(workspace.root)[name]["recall"]]
-
-
 def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, float]:
-    """Metres and degrees."""
+    """Return the pose error in metres and degrees."""
     assert isinstance(found, Pose), found
     assert truth is not None
     result = pose_errors({"it": found.cam_from_world}, {"it": truth})
@@ -80,7 +75,7 @@ def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, 
 
 
 def manifest(stage: str, **changes: Any) -> Manifest:
-    """What a finished stage leaves."""
+    """Return the manifest of a finished stage."""
     content: dict[str, Any] = {"options": {}, "inputs": {}, "outputs": (), "versions": {}}
     content |= {"seconds": 1.5, "started": "2024-01-01T00:00:00"}
     mark = f"print of {stage}"

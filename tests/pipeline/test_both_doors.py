@@ -1,4 +1,4 @@
-"""``megloc eval``, ``megloc localize`` and ``Localizer`` are one method: the same poses."""
+"""``megloc eval``, ``megloc localize`` and ``Localizer`` give the same poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     read_match_counts,
-    read_refinement,
     read_status,
 )
 from megloc_kapture.pipeline.plan import Workspace
@@ -47,14 +46,14 @@ SECOND = (
 
 
 def both(scene: Path, root: Path, *assignments: str) -> tuple[Workspace, Localizer]:
-    """A workspace with localized queries, and a localizer in its map, of the same options."""
+    """Run the stages and open a localizer in the map with the same options."""
     options = options_of_preset(assignments=[ALL_CANDIDATES, *assignments])
     workspace = evaluated(root, scene, options, last="submission")
     return workspace, Localizer(KaptureMap.open(workspace.path("map")), options=options)
 
 
 def same_poses(workspace: Workspace, localizer: Localizer) -> list[Pose]:
-    """The poses of the queries from Python, compared with those of the workspace."""
+    """Localize the queries from Python and compare with the poses of the workspace."""
     in_run = workspace.folder("localized").read()
     status = read_status(workspace.path("localized/status.csv"))
     found = dict(Results(localizer, workspace.path("query")))
@@ -67,9 +66,8 @@ def same_poses(workspace: Workspace, localizer: Localizer) -> list[Pose]:
         assert result.confidence == pytest.approx(row.confidence, rel=1e-3)
         if isinstance(result, Pose):
             assert pose is not None
-            own = [*result.cam_from_world.quat_wxyz, *result.cam_from_world.translation]
-            expected = [*pose.quat_wxyz, *pose.translation]
-            np.testing.assert_allclose(own, expected, rtol=0, atol=1e-9)
+            matrix = result.cam_from_world.matrix()
+            np.testing.assert_allclose(matrix, pose.matrix(), rtol=0, atol=1e-9)
     return [result for result in found.values() if isinstance(result, Pose)]
 
 
@@ -83,13 +81,12 @@ def with_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene with its four queries as two moments of a rig of two cameras."""
+    """The scene with its four queries as two timestamps of a rig of two cameras."""
     root = tmp_path_factory.mktemp("rig") / "scene"
     shutil.copytree(scene, root, copy_function=shutil.copyfile)
     truth = KaptureFolder(scene / "query_gt").read()
     names, poses = truth.image_names(), truth.poses()
     data = KaptureData(sensors=dict.fromkeys(("left", "right"), truth.sensors["cam"]))
-    # the second camera stands where the true poses of the first moment put it
     right_from_left = poses[names[1]] @ poses[names[0]].inverse()
     data.rigs["rig"] = {"left": RigidTransform.identity(), "right": right_from_left}
     moments = ((1, "left"), (1, "right"), (2, "left"), (3, "right"))
@@ -102,15 +99,12 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "assignments",
     [
-        pytest.param(FEW, id="classic"),
         pytest.param((*TWO_TYPES, "reranking.by=coverage", "reranking.keep=4"), id="coverage"),
         pytest.param((*FEW, *SECOND), id="second matcher"),
         *(
             pytest.param((*FEW, *more), id=name, marks=pytest.mark.slow)
             for name, more in {
-                "retrieval": ["query_pairs.top_k=4"],
                 "resized": ["preprocessing.max_size_px=240", "query_pairs.top_k=4"],
-                "matches": [*TWO_TYPES, "reranking.by=matches", "reranking.keep=3"],
                 "pyramid": [
                     "guided_pyramid.mode=all",
                     "guided_pyramid.scales=[0.5,1.0]",
@@ -135,14 +129,14 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_the_same_poses(scene: Path, tmp_path: Path, assignments: tuple[str, ...]) -> None:
-    assert len(same_poses(*both(scene, tmp_path / "workspace", *assignments))) == 4
+    workspace, localizer = both(scene, tmp_path / "workspace", *assignments)
+    assert len(same_poses(workspace, localizer)) == 4
+    if assignments == (*FEW, *SECOND):
+        check_second_matches(workspace)
 
 
-def test_the_second_matchers_matches_replace_those_of_the_best_pairs(
-    scene: Path, tmp_path: Path
-) -> None:
-    options = options_of_preset(assignments=[*FEW, *SECOND])
-    workspace = evaluated(tmp_path, scene, options, last="localization")
+def check_second_matches(workspace: Workspace) -> None:
+    """Check that matches of the second matcher replace those of the best pairs."""
     for kind, part in (("query", QUERY_MATCHES), ("mapping", MAPPING_MATCHES)):
         again = workspace.path(f"pyramid/{kind}")
         first = {
@@ -155,19 +149,16 @@ def test_the_second_matchers_matches_replace_those_of_the_best_pairs(
                 by_image.setdefault(image, []).append((-row.verified, pair))
         best = {pair for pairs in by_image.values() for _, pair in sorted(pairs)[:2]}
         assert set(second) == best and len(best) < len(first)
-        # the ratio test leaves fewer
+        # the ratio test removes matches
         assert all(row.matches < first[pair].matches for pair, row in second.items())
-        layout = Layout(options)
+        layout = Layout(options_of_preset(assignments=[*FEW, *SECOND]))
         folders = layout.query_matches() if kind == "query" else layout.mapping_matches()
         stored = workspace.folder(kind, *folders).matches(TYPE)
         for pair, row in {**first, **second}.items():
             assert stored.length(*pair) == row.verified
-    assert workspace.folder("map").types("keypoints") == [TYPE]
 
 
-def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(
-    scene: Path, tmp_path: Path
-) -> None:
+def test_a_fallback_is_the_pose_of_the_best_reranked_candidate(scene: Path, tmp_path: Path) -> None:
     sets = [
         *FEW, "localization.pose.min_inliers=5000", "localization.fallback=retrieval",
         "reranking.by=verified", "reranking.keep=3", "global_features.vlad.options.num_clusters=1",
@@ -183,7 +174,7 @@ def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(
     map_poses = workspace.folder("map").read().poses()
     assert found == {name: map_poses[image] for name, image in first[1].items()}
     assert found == workspace.folder("localized").read().poses()
-    # a type that the run does not extract is refused; a map of another tool may lack it
+    # a type that a run does not extract is refused, but not for a map of another tool
     wrong = options_of_preset(assignments=[*sets, "reranking.local_type=superpoint"])
     message = "no local features of type 'superpoint'; known: rootsift"
     with pytest.raises(OptionError, match=message):
@@ -200,20 +191,6 @@ def test_the_same_poses_of_rigs(with_rig: Path, tmp_path: Path) -> None:
     left, right = (pose.cam_from_world for pose in poses[:2])
     expected = rigs["right"] @ left
     np.testing.assert_allclose(right.translation, expected.translation, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("by", ["icp", "rendering"])
-def test_the_same_refined_poses(with_depth: Path, tmp_path: Path, by: str) -> None:
-    sets = (*FEW, f'pose_refinement.by=["{by}"]', "localization.rank=perceptual")
-    workspace, localizer = both(with_depth, tmp_path / "workspace", *sets)
-    poses = same_poses(workspace, localizer)
-    final = workspace.folder("localized").read().poses()
-    stored = read_refinement(workspace.path("localized/refinement.csv"), final)
-    assert len(stored) == len(poses) == 4
-    for pose in poses:
-        ((own,), (step,)) = pose.refinements, stored[pose.name]
-        assert (step.method, step.reason) == (by, own.reason) and own.method == by
 
 
 @pytest.mark.parametrize("by", ["icp", pytest.param("rendering", marks=pytest.mark.slow)])

@@ -1,18 +1,29 @@
-"""Where work runs: inline, or in worker processes."""
+"""Executors: inline, worker processes and dask."""
 
 from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from distributed import Client
 from threadpoolctl import threadpool_info
 
 from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.pipeline import dask_executor
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.stages.work import ordered_map
 
 
 def test_inline_and_one_worker_need_no_pool() -> None:
@@ -21,23 +32,16 @@ def test_inline_and_one_worker_need_no_pool() -> None:
             assert executor is None
 
 
-@pytest.mark.parametrize("workers", [0, -1])
-def test_no_worker_is_refused(workers: int) -> None:
-    with pytest.raises(OptionError, match=f"{workers} workers"), open_executor("inline", workers):
+def test_less_than_one_worker_is_refused() -> None:
+    with pytest.raises(OptionError, match="0 workers"), open_executor("inline", 0):
         pass
-
-
-def _torch_threads() -> int:
-    import torch
-
-    return torch.get_num_threads()
 
 
 def _log_level() -> int:
     return logging.getLogger().level
 
 
-def test_workers_are_other_processes_with_one_thread_each_and_the_same_log_level(
+def test_workers_are_processes_with_one_thread_and_the_same_log_level(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(logging.getLogger(), "level", logging.INFO)
@@ -46,11 +50,10 @@ def test_workers_are_other_processes_with_one_thread_each_and_the_same_log_level
         assert executor.submit(os.getpid).result() != os.getpid()
         counts = {pool["num_threads"] for pool in executor.submit(threadpool_info).result()}
         assert counts == {1}
-        assert executor.submit(_torch_threads).result() == 1
         assert executor.submit(_log_level).result() == logging.INFO
 
 
-def test_a_block_limits_torch_and_gives_its_threads_back() -> None:
+def test_threads_of_torch_are_restored() -> None:
     import torch
 
     before = torch.get_num_threads()
@@ -81,3 +84,96 @@ def test_an_error_does_not_wait_for_busy_workers() -> None:
             executor.submit(time.sleep, 600)
             raise ValueError("of the block")
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+@contextmanager
+def running(folder: Path, number: int = 2) -> Iterator[str]:
+    """Start a scheduler and workers in another folder; yield the address."""
+    dask = [sys.executable, "-m", "dask"]
+    settings: dict[str, Any] = {"cwd": folder, "text": True, "start_new_session": True}
+    started = [
+        subprocess.Popen(
+            [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"],
+            stderr=subprocess.PIPE,
+            **settings,
+        )
+    ]
+    try:
+        assert started[0].stderr is not None
+        line = next(line for line in started[0].stderr if "Scheduler at:" in line)
+        address = re.findall(r"tcp://\S+", line)[0]
+        worker = [*dask, "worker", address, "--nthreads", "1", "--no-dashboard"]
+        for _ in range(number):
+            started.append(subprocess.Popen(worker, stderr=subprocess.DEVNULL, **settings))
+        with Client(address, set_as_default=False) as client:
+            client.wait_for_workers(number, timeout=60)
+        yield address
+    finally:
+        for process in started:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with running(tmp_path_factory.mktemp("cluster")) as found:
+        yield found
+
+
+def _slow_square(number: int) -> tuple[int, int]:
+    time.sleep(0.02)
+    return number * number, os.getpid()
+
+
+def _threads(_: int) -> set[int]:
+    (np.ones((64, 64)) @ np.ones((64, 64))).sum()
+    return {pool["num_threads"] for pool in threadpool_info()}
+
+
+def _read(path: Path) -> str:
+    return path.read_text()
+
+
+def test_results_are_in_order_and_workers_have_one_thread(cluster: str) -> None:
+    with open_executor("dask", scheduler=cluster) as executor:
+        found = list(ordered_map(_slow_square, range(40), executor))
+        assert [square for square, _ in found] == [n * n for n in range(40)]
+        assert len({pid for _, pid in found} - {os.getpid()}) == 2
+        assert set().union(*ordered_map(_threads, range(8), executor)) == {1}
+
+
+def test_relative_paths_refer_to_the_folder_of_the_run(
+    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("here.txt").write_text("seen")
+    with open_executor("dask", scheduler=cluster, shared=Path("out")) as executor:
+        assert list(ordered_map(_read, [Path("here.txt")] * 3, executor)) == ["seen"] * 3
+    assert list(Path("out").iterdir()) == []
+
+
+def test_folders_that_workers_cannot_read_are_refused(
+    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = dask_executor._Preparation
+
+    def elsewhere(folder: Path, shared: Path) -> Any:
+        return replace(make(folder, shared), shared=Path("/nowhere/shared"))
+
+    monkeypatch.setattr(dask_executor, "_Preparation", elsewhere)
+    with (
+        pytest.raises(MeglocError, match="does not see /nowhere/shared"),
+        open_executor("dask", scheduler=cluster),
+    ):
+        pytest.fail("opened")
+
+
+def test_a_wrong_address_is_refused(cluster: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dask_executor, "_CONNECT_S", 1.0)
+    with (
+        pytest.raises(OptionError, match="no dask scheduler at tcp://127.0.0.1:1$"),
+        open_executor("dask", scheduler="tcp://127.0.0.1:1"),
+    ):
+        pass
+    with pytest.raises(OptionError, match="--scheduler"):
+        open_executor("processes", 2, cluster).__enter__()

@@ -1,4 +1,4 @@
-"""Maps of any tool: which type, whose pixel origin, what is missing."""
+"""Maps of any tool: their types, extractors, pixel origin and missing parts."""
 
 from __future__ import annotations
 
@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.geometry.cameras import project, shift_principal_point
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.live_source import extract_again, local_types_of
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.stages.matches import Features, match_all, verification_of, verified
-from megloc_kapture.values import Pose
 from tests.pipeline.runs import errors
 
 
@@ -43,7 +41,7 @@ def shift_intrinsics(root: Path, shift_px: float) -> None:
     write_sensors(root, replace(data, sensors=moved))
 
 
-def test_our_own_map_is_as_colmap_has_it(workspace: Path) -> None:
+def test_our_map_follows_colmap(workspace: Path) -> None:
     opened = KaptureMap.open(workspace / "map")
     assert list(opened.keypoints) == ["rootsift"]
     assert (opened.pixel_origin.intrinsics, opened.pixel_origin.keypoints) == ("corner", "corner")
@@ -56,7 +54,7 @@ def test_our_own_map_is_as_colmap_has_it(workspace: Path) -> None:
 
 
 @pytest.mark.parametrize("intrinsics", ["corner", "centre"])
-def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
+def test_a_half_pixel_between_keypoints_and_intrinsics_is_corrected(
     workspace: Path, map_copy: Path, intrinsics: str
 ) -> None:
     (shift_intrinsics if intrinsics == "centre" else shift_keypoints)(map_copy, -0.5)
@@ -68,85 +66,45 @@ def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
     before, after = (one.keypoints["rootsift"] for one in (original, opened))
     for image in original.images:
         np.testing.assert_allclose(after.keypoints_px(image), before.keypoints_px(image), atol=1e-3)
-        own, expected = (one.camera(image).params for one in (opened, original))
-        np.testing.assert_allclose(own, expected, atol=1e-9)
-
-
-def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> list[float]:
-    """Of each query, the median distance of its matches from where its true pose puts them."""
-    poses, options, found = KaptureFolder(truth).read().poses(), options_of_preset(), []
-    (local_type,) = opened.keypoints
-    stored, verify = opened.keypoints[local_type], verification_of(options.query_verification)
-    matcher = options.make_matcher(local_type)
-    for query in KaptureQueries(queries, opened):
-        features = query.features[local_type]
-        keypoints = features.keypoints_px[:, :2]
-        ours = Features.of(query.camera, keypoints, features.descriptors)
-        matches = []
-        for image in opened.images:
-            described = stored.keypoints_px(image), stored.descriptors(image)
-            theirs = Features.of(opened.camera(image), *described)
-            of_pair = match_all(matcher, ours, [theirs], ["theirs"])[0]
-            matches.append((image, *verified(ours, theirs, of_pair, verify)[:2]))
-        pairs = TypedMatches(stored.index, keypoints, matches).correspondences()
-        seen = project(query.camera, poses[query.name], stored.index.xyz[pairs.point_ids])
-        distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)
-        found.append(float(np.median(distances)))
-    return found
+        expected = original.camera(image).params
+        np.testing.assert_allclose(opened.camera(image).params, expected, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_the_origin_of_the_foreign_map_and_what_the_wrong_one_costs(virtual_gallery: Path) -> None:
-    """Its principal points are ((w - 1) / 2, (h - 1) / 2), its keypoints fit them as stored."""
-    right = KaptureMap.open(virtual_gallery / "map")
-    origin = right.pixel_origin
+def test_keypoints_and_intrinsics_of_the_foreign_map_have_centred_pixels(
+    virtual_gallery: Path,
+) -> None:
+    origin = KaptureMap.open(virtual_gallery / "map").pixel_origin
     assert (origin.intrinsics, origin.keypoints) == ("centre", "centre")
     assert origin.error_px["centre"] < 0.9 * origin.error_px["corner"]
-    wrong = KaptureMap.open(virtual_gallery / "map", pixel_origin="corner")
-    assert (wrong.pixel_origin.intrinsics, wrong.pixel_origin.reason) == ("corner", "as asked for")
-    # the map's points, seen from where the queries truly are; no pose can hide the half pixel
-    queries, truth = KaptureFolder(virtual_gallery / "query"), virtual_gallery / "query_gt"
-    off_px = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
-    assert off_px.shape == (2, 4)
-    assert (off_px[0] < off_px[1]).all(), off_px
+    chosen = KaptureMap.open(virtual_gallery / "map", pixel_origin="corner").pixel_origin
+    assert (chosen.intrinsics, chosen.reason) == ("corner", "as asked for")
 
 
-def test_queries_are_described_as_their_map(workspace: Path, map_copy: Path, scene: Path) -> None:
-    # a map, and queries, that are all described with the origin at the centre
-    shift_intrinsics(map_copy, -0.5)
-    query = map_copy.parent / "query"
-    shutil.copytree(scene / "query", query, symlinks=True)
-    shift_intrinsics(query, -0.5)
-    queries, truth = KaptureFolder(query, features_dirs=[workspace]), scene / "query_gt"
-    right = KaptureMap.open(map_copy)
-    wrong = KaptureMap.open(map_copy, pixel_origin="corner")
-    off_px = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
-    # half of one query's few matches are wrong ones
-    assert np.median(off_px[0]) < 0.6 * np.median(off_px[1]), off_px
-    # and the poses are those of the map before
-    before = Localizer(KaptureMap.open(workspace / "map"))
-    original = KaptureFolder(scene / "query", features_dirs=[workspace])
-    expected = Results(before, original)
-    for name, pose in Results(Localizer(right), queries).items():
-        reference = expected[name]
-        assert isinstance(reference, Pose)
-        assert errors(pose, reference.cam_from_world)[0] < 1e-3
-
-
-@pytest.mark.slow
-def test_opening_writes_nothing_and_reads_through_links(
-    virtual_gallery: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "link").symlink_to(virtual_gallery / "map")
-    before = {p: p.stat().st_mtime_ns for p in virtual_gallery.rglob("*")}
-    opened = KaptureMap.open(tmp_path / "link")
-    opened.check()
-    assert len(opened.images) == 12
-    assert {p: p.stat().st_mtime_ns for p in virtual_gallery.rglob("*")} == before
+def test_queries_have_the_origin_of_their_map(workspace: Path, map_copy: Path, scene: Path) -> None:
+    query = Path(shutil.copytree(scene / "query", map_copy.parent / "query", symlinks=True))
+    for root in (map_copy, query):
+        shift_intrinsics(root, -0.5)
+    original = Results(
+        Localizer(KaptureMap.open(workspace / "map")),
+        KaptureFolder(scene / "query", features_dirs=[workspace]),
+    )
+    queries = KaptureFolder(query, features_dirs=[workspace])
+    moved_m = {
+        origin: [
+            errors(pose, original[name].cam_from_world)[0]  # type: ignore[union-attr]
+            for name, pose in Results(Localizer(opened), queries).items()
+        ]
+        for origin, opened in (
+            ("auto", KaptureMap.open(map_copy)),
+            ("corner", KaptureMap.open(map_copy, pixel_origin="corner")),
+        )
+    }
+    assert max(moved_m["auto"]) < 1e-3 < min(moved_m["corner"])
 
 
 def add_type(root: Path, name: str) -> None:
-    """Give the map the same points and keypoints under another type as well."""
+    """Add a copy of the points and keypoints under another type."""
     for kind in ("keypoints", "descriptors"):
         folder = root / "reconstruction" / kind
         shutil.copytree(folder / "rootsift", folder / name)
@@ -156,19 +114,19 @@ def add_type(root: Path, name: str) -> None:
     observations.write_text("".join(rows))
 
 
-def test_all_types_with_points_are_localized_with_unless_some_are_chosen(map_copy: Path) -> None:
+def test_all_types_are_used_unless_some_are_chosen(map_copy: Path) -> None:
     add_type(map_copy, "other")
     both = KaptureMap.open(map_copy)
     assert list(both.keypoints) == ["other", "rootsift"]
     opened = KaptureMap.open(map_copy, keypoints_types=["other"])
     assert list(opened.keypoints) == ["other"]
-    # the name inside its configuration tells who extracted it
+    # the configuration has the name of the extractor
     assert opened.keypoints["other"].extractor() == PluginChoice(name="rootsift")
     with pytest.raises(OptionError, match="'third'; there are: other, rootsift"):
         KaptureMap.open(map_copy, keypoints_types=["third"])
 
 
-def test_what_cannot_be_opened(workspace: Path, map_copy: Path, tmp_path: Path) -> None:
+def test_unusable_maps_are_refused(workspace: Path, map_copy: Path, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="give auto, corner or centre"):
         KaptureMap.open(map_copy, pixel_origin="middle")  # type: ignore[arg-type]
     with pytest.raises(DataError, match="no such kapture folder"):
@@ -182,7 +140,7 @@ def test_what_cannot_be_opened(workspace: Path, map_copy: Path, tmp_path: Path) 
         KaptureMap.open(map_copy)
 
 
-def test_features_may_lie_elsewhere_and_their_sizes_are_checked_without_reading(
+def test_features_of_other_folders_are_used_and_their_sizes_checked(
     workspace: Path, map_copy: Path
 ) -> None:
     opened = KaptureMap.open(map_copy)
@@ -196,3 +154,80 @@ def test_features_may_lie_elsewhere_and_their_sizes_are_checked_without_reading(
     opened = KaptureMap.open(map_copy, features_dirs=[workspace])
     assert opened.keypoints["rootsift"].has_descriptors(opened.images)
     opened.check()
+
+
+@pytest.fixture
+def stripped(map_copy: Path) -> KaptureMap:
+    """Our map, of 800 keypoints an image, without its descriptors."""
+    shutil.rmtree(map_copy / "reconstruction" / "descriptors")
+    return KaptureMap.open(map_copy)
+
+
+def again(opened: KaptureMap, **options: float) -> dict[str, np.ndarray]:
+    """Return descriptors of the map by RootSIFT with the given options."""
+    extractor = RootSift(RootSiftOptions(**options))  # type: ignore[arg-type]
+    return extract_again(opened, opened.keypoints["rootsift"], extractor)
+
+
+@pytest.mark.parametrize("number", [800, 400])
+def test_descriptors_are_extracted_again(
+    workspace: Path, stripped: KaptureMap, number: int
+) -> None:
+    original = KaptureMap.open(workspace / "map")
+    found = again(stripped, max_keypoints=number)
+    assert sorted(found) == original.images
+    for image, descriptors in found.items():
+        known = descriptors.any(axis=1)
+        assert 0.75 * number < known.sum() <= number
+        assert number < 800 or known.all()
+        stored = original.keypoints["rootsift"].descriptors(image)
+        np.testing.assert_array_equal(descriptors[known], stored[known])
+
+
+def test_a_map_of_another_extractor_or_without_images_is_refused(stripped: KaptureMap) -> None:
+    with pytest.raises(DataError, match=r"finds only \d+ of \d+ observed keypoints"):
+        again(stripped, contrast_threshold=0.2)
+    (stripped.folder.root / "sensors" / "records_data").unlink()
+    with pytest.raises(DataError, match="no descriptors of type 'rootsift', and no images"):
+        again(KaptureMap.open(stripped.folder.root))
+
+
+def rename_type(root: Path, name: str, keypoints: str, descriptors: str) -> None:
+    """Rename the type of a map and write the configurations of its features."""
+    reconstruction = root / "reconstruction"
+    for kind, row in (("keypoints", keypoints), ("descriptors", descriptors)):
+        folder = (reconstruction / kind / "rootsift").rename(reconstruction / kind / name)
+        (folder / f"{kind}.txt").write_text(f"# kapture format: 1.1\n# name\n{row}\n")
+    observations = reconstruction / "observations.txt"
+    observations.write_text(observations.read_text().replace("rootsift", name))
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "dtype", "expected"),
+    [
+        ("SIFT", "SIFT", "uint8", "sift"),
+        ("sift", "sift", "float32", "rootsift"),
+        ("sift_8192", "x", "uint8", "sift"),
+        ("SuperPoint-v1", "x", "float32", "superpoint superpoint_v1"),
+        ("ALIKED_N16ROT", "x", "float32", "aliked aliked-n16rot"),
+        ("r2d2_500", "x", "float32", "r2d2"),
+        ("R2D2-WASF-N16", "x", "float32", "r2d2 r2d2_WASF_N16"),
+        ("mine", "Aliked", "float32", "aliked"),
+        ("D2-Net", "d2net", "float32", None),
+        ("orb_800", "x", "uint8", None),
+    ],
+)
+def test_extractors_are_recognised_by_names_of_other_tools(
+    name: str, config: str, dtype: str, expected: str | None, map_copy: Path
+) -> None:
+    rename_type(map_copy, name, f"{config}, float32, 2", f"{config}, {dtype}, 128, {name}, L2")
+    keypoints = KaptureMap.open(map_copy).keypoints[name]
+    found = keypoints.extractor()
+    assert expected == (found and " ".join([found.name, *map(str, found.options.values())]))
+
+
+def test_an_unknown_type_is_refused_with_the_remedy(map_copy: Path) -> None:
+    rename_type(map_copy, "D2-Net", "d2net, float32, 2", "d2net, float32, 128, D2-Net, L2")
+    (local,) = local_types_of(KaptureMap.open(map_copy), options_of_preset("classic"))
+    with pytest.raises(DataError, match=r"'D2-Net'.*known: .*rootsift.*D2-Net/keypoints\.txt"):
+        _ = local.extractor

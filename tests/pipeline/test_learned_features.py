@@ -1,4 +1,4 @@
-"""A preset with learned features, in a whole run and from Python."""
+"""A preset with learned features, in a run and from Python."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def real_weights(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def modern(*assignments: str) -> PipelineOptions:
-    """The preset, on small images with few keypoints, once there are its features."""
+    """Return the preset with small images and few keypoints."""
     small = ("preprocessing.max_size_px=640", "global_features.options.num_clusters=16")
     few = "local_features.aliked.options.max_keypoints=600"
     return options_of_preset("modern", assignments=[*assignments, few, *small])
@@ -35,7 +35,7 @@ def test_modern_maps_smaller_images_and_localizes_whole_ones(
 ) -> None:
     options = modern()
     workspace = evaluated(tmp_path / "workspace", fountain, options)
-    # what is written of the queries is as they were imported
+    # localized queries have their original size
     for folder, width in (("map", 640), ("localized", 1536)):
         data = workspace.folder(folder).read()
         assert {data.camera_of(image).width for image in data.image_names()} == {width}

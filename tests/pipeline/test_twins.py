@@ -1,4 +1,4 @@
-"""The four rendered twins, small, from their official layout to a recall table and a pose file."""
+"""The four rendered twins, from their official layout to a recall table and a pose file."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ SMALL: dict[str, dict[str, Any]] = {
     "4seasons": {"num_places": 2, "map_keyframes": 24, "winter_keyframes": 6, "dusk_keyframes": 2},
     "inloc": {"queries": 6},
 }
-# conditions that are hard by design: a failure there is reported, not hidden
+# conditions that are hard by design
 DARK = {"night", "night-rain", "night-all", "all"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
-def test_a_twin_from_its_layout_to_what_is_handed_in(name: str, tmp_path: Path) -> None:
+def test_a_twin_from_its_layout_to_a_pose_file(name: str, tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "workspace")
     run_twin(workspace, name, SMALL[name])
     rows = recall_rows(workspace.root)

@@ -6,7 +6,6 @@ import tarfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind, feature_folder
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.stages.global_features import extract_vlad
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
@@ -67,7 +65,7 @@ QUERY_POSES = {
 
 @dataclass(frozen=True)
 class World:
-    """Where everything of the small world is."""
+    """Folders of a small scene and its map."""
 
     root: Path
     map_poses: dict[str, RigidTransform]
@@ -92,14 +90,14 @@ class World:
     def localized(
         self, pairs: list[ImagePair] | None = None, **options: Any
     ) -> list[Pose | Failure]:
-        """The queries, from the matches that are stored."""
+        """Localize the queries from stored matches."""
         work = options.pop("work", HERE)
         chosen = LocalizationOptions(**options)
-        found = localize_from_matches(
+        results = localize_from_matches(
             self.map(), self.query(), self.with_matches("query"), pairs or self.query_pairs(),
             ["rootsift"], chosen, work=work,
         )  # fmt: skip
-        return list(found)
+        return list(results)
 
     def with_matches(self, kind: str) -> KaptureFolder:
         return KaptureFolder(self.root / "mapping", features_dirs=[self.root / "matches" / kind])
@@ -107,7 +105,7 @@ class World:
 
 @pytest.fixture(scope="session")
 def images_only(tmp_path_factory: pytest.TempPathFactory) -> World:
-    """The two kapture folders, with images only."""
+    """Two kapture folders with images only."""
     root = tmp_path_factory.mktemp("corner")
     write_kapture(root / "mapping", MAP_POSES, with_poses=True)
     write_kapture(root / "query", QUERY_POSES, with_poses=False)
@@ -116,46 +114,30 @@ def images_only(tmp_path_factory: pytest.TempPathFactory) -> World:
 
 @pytest.fixture(scope="session")
 def world(images_only: World) -> World:
-    """The world with everything that the stages make of it, each by its own stage."""
-    it = images_only
+    """The scene with features, pairs, matches and a map, written by the stages."""
+    scene = images_only
     with single_threaded():
-        extract_local_features([it.mapping(), it.query()], EXTRACTOR, it.features_dir)
-        extract_vlad(it.mapping(), [it.mapping(), it.query()], "rootsift", it.features_dir, VLAD)
-        pairs = pair_map_images(it.mapping(), MappingPairsOptions(), retrieval=BY_VLAD)
+        extract_local_features([scene.mapping(), scene.query()], EXTRACTOR, scene.features_dir)
+        extract_vlad(
+            scene.mapping(), [scene.mapping(), scene.query()], "rootsift", scene.features_dir, VLAD
+        )
+        pairs = pair_map_images(scene.mapping(), MappingPairsOptions(), retrieval=BY_VLAD)
         for first, some, how, name in (
-            (it.mapping(), pairs, KnownPoseOptions(), "mapping"),
-            (it.query(), it.query_pairs(), TwoViewOptions(), "query"),
+            (scene.mapping(), pairs, KnownPoseOptions(), "mapping"),
+            (scene.query(), scene.query_pairs(), TwoViewOptions(), "query"),
         ):
-            output = it.root / "matches" / name
-            match_pairs(first, it.mapping(), some, "rootsift", NearestNeighbours(), how, output)
+            output = scene.root / "matches" / name
+            match_pairs(first, scene.mapping(), some, "rootsift", NearestNeighbours(), how, output)
         triangulate_map(
-            it.mapping(), it.with_matches("mapping"), "rootsift", it.root / "map",
+            scene.mapping(), scene.with_matches("mapping"), "rootsift", scene.root / "map",
             TriangulationOptions(),
         )  # fmt: skip
-    return it
-
-
-@pytest.fixture(scope="session")
-def make_map() -> Callable[[KaptureFolder, LocalFeatureExtractor, Path], KaptureFolder]:
-    """Makes a map of posed images by an extractor: every two of them are matched."""
-
-    def make(images: KaptureFolder, extractor: LocalFeatureExtractor, root: Path) -> KaptureFolder:
-        folder, name = images.with_features([root]), extractor.name
-        pairs = [ImagePair(a, b, 1.0) for a, b in combinations(images.read().image_names(), 2)]
-        with single_threaded():
-            extract_local_features([folder], extractor, root)
-            folder, how = images.with_features([root]), KnownPoseOptions()
-            match_pairs(folder, folder, pairs, name, NearestNeighbours(), how, root / "matches")
-            matches = images.with_features([root / "matches"])
-            triangulate_map(folder, matches, name, root / "map", TriangulationOptions())
-        return KaptureFolder(root / "map")
-
-    return make
+    return scene
 
 
 @pytest.fixture(scope="session")
 def write_features() -> Callable[..., None]:
-    """Writes arrays by image as features of a type, which they are all like."""
+    """Function that writes arrays by image as features of a type."""
 
     def write(
         root: Path,
@@ -186,26 +168,15 @@ def write_features() -> Callable[..., None]:
 
 @pytest.fixture(scope="session")
 def two_processes() -> Iterator[Executor]:
-    """Two worker processes, as a run has them."""
+    """An executor with two worker processes."""
     with open_executor("processes", 2) as executor:
         assert executor is not None
         yield executor
 
 
 @pytest.fixture(scope="session")
-def folder_bytes() -> Callable[[Path], dict[str, bytes]]:
-    """Every file below a folder, by relative path."""
-
-    def read(folder: Path) -> dict[str, bytes]:
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
-        return {str(path.relative_to(folder)): path.read_bytes() for path in files}
-
-    return read
-
-
-@pytest.fixture(scope="session")
 def distance_to_walls() -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Distance in metres of points (N, 3) to the nearer wall's plane, the truth of the map."""
+    """Function: distances in metres of points (N, 3) to the plane of the nearer wall."""
 
     def measure(points: NDArray[np.float64]) -> NDArray[np.float64]:
         distances = []
@@ -219,7 +190,7 @@ def distance_to_walls() -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
 
 @pytest.fixture
 def small_kapture(tmp_path: Path) -> Callable[..., KaptureFolder]:
-    """Makes a kapture of images given as arrays."""
+    """Function that writes images (arrays by name) as a kapture folder."""
 
     def make(
         images: dict[str, NDArray[np.uint8]],
@@ -232,8 +203,10 @@ def small_kapture(tmp_path: Path) -> Callable[..., KaptureFolder]:
         data = KaptureData()
         for timestamp, (image, pixels) in enumerate(images.items()):
             height, width = pixels.shape[:2]
-            own = camera or Camera("SIMPLE_PINHOLE", width, height, (300.0, width / 2, height / 2))
-            data.sensors[f"cam{timestamp}"] = Sensor.from_camera(own)
+            image_camera = camera or Camera(
+                "SIMPLE_PINHOLE", width, height, (300.0, width / 2, height / 2)
+            )
+            data.sensors[f"cam{timestamp}"] = Sensor.from_camera(image_camera)
             data.records_camera[timestamp, f"cam{timestamp}"] = image
             if poses and image in poses:
                 data.trajectories[timestamp, f"cam{timestamp}"] = poses[image]

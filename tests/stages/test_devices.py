@@ -1,4 +1,4 @@
-"""Batches: the same features and matches, halved where memory runs out; where networks compute."""
+"""Batches on a device: equal results, smaller batches when memory runs out, placement."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.plugin_loading import Placement, load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, POSE_RANKERS
 from megloc_kapture.stages import work as devices
-from megloc_kapture.stages import work as work_module
 from megloc_kapture.stages.local_features import (
     ExtractLocalFeatures,
     extract_all,
@@ -41,6 +40,7 @@ from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
 from megloc_kapture.stages.stage import wanted_stages
 from megloc_kapture.stages.work import Work, in_batches, is_out_of_memory
 from megloc_kapture.values import ImageFeatures, LocalFeatures
+from tests.worlds import folder_bytes
 
 Image = NDArray[np.uint8]
 NAMES = [f"{k}.jpg" for k in range(5)]
@@ -48,21 +48,21 @@ NAMES = [f"{k}.jpg" for k in range(5)]
 
 @pytest.fixture(scope="module")
 def frames(shared_data: Path) -> list[tuple[Image, NDArray[np.bool_] | None]]:
-    """Photographs of one size, one of them with a mask."""
+    """Photographs of one size, the third with a mask."""
     folder = shared_data / "scenes" / "fountain_p11" / "mapping" / "sensors" / "records_data"
     found: list[tuple[Image, NDArray[np.bool_] | None]] = []
     for path in sorted(folder.rglob("*.jpg"))[:5]:
-        small = cv2.resize(read_image_rgb(path), (192, 128), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(read_image_rgb(path), (144, 96), interpolation=cv2.INTER_AREA)
         found.append((np.asarray(small, np.uint8), None))
-    half = np.zeros((128, 192), bool)
-    half[:, :96] = True
+    half = np.zeros((96, 144), bool)
+    half[:, :72] = True
     found[2] = found[2][0], half
     return found
 
 
 @pytest.fixture(scope="module")
 def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Checkpoints of networks whose own are not free."""
+    """Random checkpoints of networks whose published weights are not free."""
     folder = tmp_path_factory.mktemp("random")
     torch.manual_seed(1)
     torch.save(SuperPointNet().state_dict(), folder / "superpoint.pth")
@@ -81,29 +81,29 @@ def test_features_of_a_batch(
     of = {"aliked": "aliked/aliked-n16.pth", "xfeat": "xfeat/xfeat.pt"}
     of["r2d2"] = "r2d2/r2d2_WASF_N16.pt"
     path = shared_data / "weights" / of[name] if name in of else random_weights / f"{name}.pth"
-    options = {"min_size": 96, "max_size": 144} if name == "r2d2" else {}
+    options = {"min_size": 80, "max_size": 100} if name == "r2d2" else {}
     given = {"weights": str(path), "device": "cpu", **options}
     extractor = load_plugin(LOCAL_FEATURES, name, given)
-    frames = frames[1:4]  # one of them masked
+    frames = frames[1:3]  # the second with a mask
     alone = [extractor.extract(*frame) for frame in frames]
-    assert min(len(found.scores) for found in alone) > 20
+    assert min(len(found.scores) for found in alone) > 10
     together = extractor.extract_many(*map(list, zip(*frames, strict=True)))
     for a, b in zip(alone, together, strict=True):
-        # all keypoints but those whose score is at the threshold by a last bit
+        # scores within rounding of the threshold may differ
         distance, row = cKDTree(a.keypoints_px[:, :2]).query(b.keypoints_px[:, :2])
         near = distance < 0.01
         assert near.sum() >= 0.99 * max(len(a.scores), len(b.scores))
-        np.testing.assert_allclose(a.scores[row[near]], b.scores[near], atol=1e-4)
+        np.testing.assert_allclose(a.scores[row[near]], b.scores[near], rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(a.descriptors[row[near]], b.descriptors[near], atol=5e-3)
         assert a.num_masked == pytest.approx(b.num_masked, abs=2)
-    # on a processor each runs alone: the same bytes, whatever it comes with
-    for a, b in zip(alone, extract_all(extractor, frames, NAMES[1:4]), strict=True):
+    # on a CPU each image runs alone: equal bytes
+    for a, b in zip(alone, extract_all(extractor, frames, NAMES[1:3]), strict=True):
         assert a.keypoints_px.tobytes() == b.keypoints_px.tobytes()
         assert a.descriptors.tobytes() == b.descriptors.tobytes()
 
 
 class Limited:
-    """A plugin whose device has memory for so many items; it gives each back."""
+    """A plugin whose device has memory for a number of items; it returns them."""
 
     options = SimpleNamespace(device="cpu")
     name = "limited"
@@ -140,7 +140,7 @@ def batched(plugin: Any, run: Any) -> list[str]:
 
 def test_memory_that_runs_out_halves_the_batch(eight_at_once: None, frames: Any) -> None:
     plugin = Limited(most=2)
-    for sizes in ([5, 2, 2, 1], [2, 2, 1]):  # what is known stays known
+    for sizes in ([5, 2, 2, 1], [2, 2, 1]):  # the limit is remembered
         assert batched(plugin, lambda items: plugin.match_many(None, items)) == NAMES
         assert plugin.seen == sizes
         plugin.seen.clear()
@@ -153,7 +153,7 @@ def test_memory_that_runs_out_halves_the_batch(eight_at_once: None, frames: Any)
     assert none.seen == [5, 2, 1, 2, 1]
 
 
-def test_errors_of_another_kind_come_through(eight_at_once: None) -> None:
+def test_other_errors_are_not_retried(eight_at_once: None) -> None:
     def broken(_: Any) -> Any:
         raise RuntimeError("sizes do not agree")
 
@@ -163,38 +163,32 @@ def test_errors_of_another_kind_come_through(eight_at_once: None) -> None:
         batched(Limited(9), lambda _: [])
 
 
-@pytest.mark.parametrize("name", ["lighterglue", pytest.param("lightglue", marks=pytest.mark.slow)])
 def test_matches_of_a_batch(
-    shared_data: Path, frames: Any, name: str, monkeypatch: pytest.MonkeyPatch
+    shared_data: Path, frames: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(devices, "_limits", {})
-    kinds = {
-        "lighterglue": ("xfeat/xfeat.pt", "lighterglue/xfeat-lighterglue.pt"),
-        "lightglue": ("aliked/aliked-n16rot.pth", "aliked_lightglue/aliked_lightglue.pth"),
-    }
-    files = [str(shared_data / "weights" / one) for one in kinds[name]]
-    options = {"weights": files[0], "threshold": 0.02, "device": "cpu"}
-    extractor = load_plugin(LOCAL_FEATURES, Path(files[0]).parent.name, options)
+    weights = shared_data / "weights"
+    options = {"weights": str(weights / "xfeat" / "xfeat.pt"), "threshold": 0.02, "device": "cpu"}
+    extractor = load_plugin(LOCAL_FEATURES, "xfeat", options)
     images = [
-        ImageFeatures(found.keypoints_px[:number], found.descriptors[:number], 192, 128)
-        for number, found in zip(
+        ImageFeatures(features.keypoints_px[:number], features.descriptors[:number], 144, 96)
+        for number, features in zip(
             (200, 300, 150, 0, 250), (extractor.extract(image) for image, _ in frames), strict=True
         )
     ]
-    matcher = load_plugin(MATCHERS, name, {"weights": files[1], "device": "cpu"})
+    options = {"weights": str(weights / "lighterglue" / "xfeat-lighterglue.pt"), "device": "cpu"}
+    matcher = load_plugin(MATCHERS, "lighterglue", options)
     first, *others = images
     alone = [matcher.match(first, other) for other in others]
     assert sum(len(matches) for matches, _ in alone) > 30
-    together = matcher.match_many(first, others)  # of different size: padded
+    together = matcher.match_many(first, others)  # padded to one size
     for (matches, scores), (expected, expected_scores) in zip(together, alone, strict=True):
         np.testing.assert_array_equal(matches, expected)
         np.testing.assert_allclose(scores, expected_scores, atol=1e-4)
-    for ours, theirs in zip(match_all(matcher, first, others, NAMES[1:]), alone, strict=True):
-        assert ours[1].tobytes() == theirs[1].tobytes()
 
 
 class ManySift(RootSift):
-    """Takes several images at once."""
+    """Extracts several images at once."""
 
     def __init__(self) -> None:
         super().__init__(RootSiftOptions(max_keypoints=300))
@@ -207,16 +201,15 @@ class ManySift(RootSift):
         return [self.extract(*each) for each in zip(images, masks, strict=True)]
 
 
-def test_one_process_has_the_gpu(
+def test_one_thread_uses_the_gpu(
     world: Any,
     tmp_path: Path,
     two_processes: Executor,
-    folder_bytes: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What runs where a GPU is: here with a processor in its place."""
     folders = [world.mapping(), world.query()]
-    pairs = [ImagePair(q, m, 1.0) for q in world.query_poses for m in world.map_poses]
+    images = sorted(world.map_poses)[:2]
+    pairs = [ImagePair(query, image, 1.0) for query in world.query_poses for image in images]
 
     def run(output: Path, work: Work) -> ManySift:
         extractor, matcher = ManySift(), NearestNeighbours()
@@ -230,20 +223,20 @@ def test_one_process_has_the_gpu(
     monkeypatch.setattr(devices, "BATCH", 3)
     run(tmp_path / "here", Work())
     monkeypatch.setattr(
-        work_module, "on_gpu", lambda plugin: isinstance(plugin, RootSift | NearestNeighbours)
+        devices, "on_gpu", lambda plugin: isinstance(plugin, RootSift | NearestNeighbours)
     )
     there = run(tmp_path / "there", Work(two_processes))
     assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
-    assert there.seen == [3, 3]  # and one alone
+    assert there.seen == [3, 3]  # and the seventh image alone
     assert len(there.threads) == 1 and threading.get_ident() not in there.threads
 
 
 # ------------------------------------------------------------------------------------ options
 
 
-def test_the_run_places_networks_that_name_no_device() -> None:
+def test_networks_without_a_device_use_that_of_the_run() -> None:
     placement = Placement("cuda:1", half_precision=True)
-    plain = load_plugin(MATCHERS, "nn", {"max_ratio": 0.9}, placement)  # has no such options
+    plain = load_plugin(MATCHERS, "nn", {"max_ratio": 0.9}, placement)  # without these options
     assert plain.options.max_ratio == 0.9
     ranking = {"distance": {"name": "structure"}, "device": "cpu"}
     ranker = load_plugin(POSE_RANKERS, "perceptual", ranking, placement)
@@ -254,7 +247,9 @@ def test_the_run_places_networks_that_name_no_device() -> None:
     assert stage.placement == placement
 
 
-def test_where_it_was_done_is_no_part_of_what_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_depend_on_precision_not_on_the_device(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     stages = ExtractLocalFeatures, MatchQueries
     network = SimpleNamespace(options=SimpleNamespace(half_precision=False))
     for stage in stages:
@@ -266,14 +261,8 @@ def test_where_it_was_done_is_no_part_of_what_was_done(monkeypatch: pytest.Monke
     assert plain == here != half
 
 
-@pytest.mark.parametrize("wrong", ["gpu", "cuda:x", "cuda:-1", "CPU"])
-def test_no_such_device(wrong: str) -> None:
-    with pytest.raises(OptionError, match="option device: "):
-        options_of_preset("megloc", assignments={"device": wrong})
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_no_gpu() -> None:
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_device_without_a_gpu_is_refused() -> None:
     assert pick_device("auto") == pick_device("cpu") == torch.device("cpu")
     for device in ("cuda", "cuda:0", "cuda:3"):
         with pytest.raises(OptionError, match=f"device={device}: this machine has no GPU"):
@@ -290,14 +279,14 @@ def test_no_gpu() -> None:
         ("CUDA error: device-side assert triggered", False),
     ],
 )
-def test_every_library_runs_out_of_memory_in_its_own_words(message: str, expected: bool) -> None:
+def test_out_of_memory_is_recognised(message: str, expected: bool) -> None:
     assert is_out_of_memory(RuntimeError(message)) == expected
 
 
-def test_a_localizer_is_told(world: Any) -> None:
+def test_a_localizer_takes_device_and_precision(world: Any) -> None:
     opened = KaptureMap.open(world.root / "map", features_dirs=[world.features_dir])
-    told = Localizer(opened, preset="modern", device="cpu", precision="half").options
-    assert told.placement == Placement("cpu", half_precision=True)
+    placed = Localizer(opened, preset="modern", device="cpu", precision="half").options
+    assert placed.placement == Placement("cpu", half_precision=True)
     options = options_of_preset("classic", assignments={"device": "cpu"})
     with pytest.raises(OptionError, match="give the device and the precision in the options"):
         Localizer(opened, options=options, device="cuda")

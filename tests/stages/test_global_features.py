@@ -1,4 +1,4 @@
-"""One vector per image: batches, what plugins may not return, and what is written."""
+"""Global features as a stage: batches, checks of plugins and stored vocabularies."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ from megloc_kapture.stages.global_features import (
     write_vocabulary,
 )
 from megloc_kapture.stages.work import Work
+from tests.worlds import folder_bytes
 
 
 class Colours:
-    """Mean, deviation and corner of the colours: cheap, and tells images apart."""
+    """Mean, deviation and first pixel of the colours: cheap and distinct."""
 
     name = "colours"
 
@@ -37,8 +38,6 @@ class Colours:
 
 
 class ManyColours(Colours):
-    """The same, several images at once."""
-
     name = "many_colours"
 
     def __init__(self) -> None:
@@ -55,8 +54,8 @@ def read(folder: Path, name: str) -> dict[str, np.ndarray]:
     return {image: reader.read(image).reshape(-1) for image in reader.names}
 
 
-def test_every_image_of_map_and_queries_is_described_alone_or_in_batches(
-    world: Any, tmp_path: Path, folder_bytes: Any, monkeypatch: pytest.MonkeyPatch
+def test_images_are_described_alone_or_in_batches(
+    world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(devices, "BATCH", 4)
     folders, many = [world.mapping(), world.query()], ManyColours()
@@ -67,30 +66,21 @@ def test_every_image_of_map_and_queries_is_described_alone_or_in_batches(
     assert counts == {"images": len(singly)} and max(many.seen) == 4
     for image, vector in singly.items():
         np.testing.assert_array_equal(vector, together[image])
-    vectors = np.stack(list(singly.values()))
-    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, rtol=1e-6)
-    assert len(np.unique(vectors, axis=0)) == len(vectors)
     with ThreadPoolExecutor(3) as executor:
-        extract_global_features(folders, Colours(), tmp_path / "there", work=Work(executor))
+        extract_global_features(folders, Colours(), tmp_path / "threads", work=Work(executor))
     place = Path("global_features", "colours")
-    assert folder_bytes(tmp_path / "there" / place) == folder_bytes(tmp_path / place)
+    assert folder_bytes(tmp_path / "threads" / place) == folder_bytes(tmp_path / place)
 
 
-@pytest.mark.parametrize(
-    ("returned", "what"),
-    [
-        ([1.0, 0.0], "got list, expected float32"),
-        (np.array([3, 4], np.float32), "a vector of length 5, expected 1"),
-    ],
-)
-def test_what_a_plugin_may_not_return(returned: Any, what: str) -> None:
+def test_wrong_vectors_of_a_plugin_are_refused() -> None:
     class Wrong:
         name = "wrong"
 
         def describe(self, image: np.ndarray) -> Any:
-            return returned
+            return np.array([3, 4], np.float32)
 
-    with pytest.raises(PluginError, match=f"'wrong' on image a.png: .*{what}"):
+    message = "'wrong' on image a.png: .*a vector of length 5, expected 1"
+    with pytest.raises(PluginError, match=message):
         describe_images(Wrong(), [np.zeros((4, 4, 3), np.uint8)], ["a.png"])
 
 
@@ -106,11 +96,10 @@ VLAD = VladOptions(num_clusters=8)
 
 
 PLACE = Path("global_features", "vlad_rootsift")
-WHITENED = VLAD.model_copy(update={"vocabularies": 2, "dimensions": 3})
 
 
 def assert_described_by(root: Path, folders: list[KaptureFolder], options: VladOptions) -> None:
-    """All vectors are those of the vocabulary that is stored beside them."""
+    """Compare all vectors with those by the vocabulary in the same folder."""
     found = read_vocabulary(root / PLACE)
     assert found is not None
     vocabulary, settings = found
@@ -123,9 +112,7 @@ def assert_described_by(root: Path, folders: list[KaptureFolder], options: VladO
             np.testing.assert_allclose(stored.read(image), expected, atol=1e-5)
 
 
-def test_the_vocabulary_knows_nothing_of_the_queries(
-    world: Any, tmp_path: Path, folder_bytes: Any
-) -> None:
+def test_the_vocabulary_does_not_depend_on_the_queries(world: Any, tmp_path: Path) -> None:
     assert_described_by(world.features_dir, [world.mapping(), world.query()], VLAD)
     with single_threaded():
         extract_vlad(world.mapping(), [world.mapping()], "rootsift", tmp_path, VLAD)
@@ -148,30 +135,18 @@ def test_a_map_with_too_few_descriptors_is_refused(
         extract_vlad(folder, [folder], "rootsift", tmp_path / "out", options)
 
 
-RNG = np.random.default_rng(0)
-PLAIN = Vocabulary(RNG.normal(size=(2, 3, 5)).astype(np.float32))
-WITH_PCA = Vocabulary(
-    PLAIN.centres,
-    PcaWhitening(*(RNG.normal(size=size).astype(np.float32) for size in (30, (4, 30)))),
-)
-SOFT = VladOptions(assignment="soft", vocabularies=2)
-SOFT_PCA = SOFT.model_copy(update={"dimensions": 7})
-
-
-@pytest.mark.parametrize(("vocabulary", "options"), [(PLAIN, SOFT), (WITH_PCA, SOFT_PCA)])
-def test_a_vocabulary_comes_back_as_it_was(
-    tmp_path: Path, vocabulary: Vocabulary, options: VladOptions, folder_bytes: Any
-) -> None:
+def test_a_stored_vocabulary_is_read_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    mean, projection = (rng.normal(size=size).astype(np.float32) for size in (30, (4, 30)))
+    centres = rng.normal(size=(2, 3, 5)).astype(np.float32)
     assert read_vocabulary(tmp_path) is None
-    for name in "ab":
-        write_vocabulary(tmp_path / name, vocabulary, "r2d2", options)
-    assert folder_bytes(tmp_path / "a") == folder_bytes(tmp_path / "b")
-    found = read_vocabulary(tmp_path / "a")
-    assert found is not None
-    np.testing.assert_array_equal(found[0].centres, vocabulary.centres)
-    assert found[1].local_type == "r2d2" and found[1].options == options
-    assert (found[0].whitening is None) == (vocabulary.whitening is None)
-    if found[0].whitening is not None and vocabulary.whitening is not None:
-        for part in ("mean", "projection"):
-            mine, theirs = (getattr(one.whitening, part) for one in (found[0], vocabulary))
-            np.testing.assert_array_equal(mine, theirs)
+    for whitening, size in ((None, None), (PcaWhitening(mean, projection), 4)):
+        options = VladOptions(assignment="soft", vocabularies=2, dimensions=size)
+        write_vocabulary(tmp_path / "v", Vocabulary(centres, whitening), "r2d2", options)
+        vocabulary, settings = read_vocabulary(tmp_path / "v") or pytest.fail("no vocabulary")
+        np.testing.assert_array_equal(vocabulary.centres, centres)
+        assert (settings.local_type, settings.options) == ("r2d2", options)
+        assert (vocabulary.whitening is None) == (whitening is None)
+    assert vocabulary.whitening is not None
+    np.testing.assert_array_equal(vocabulary.whitening.mean, mean)
+    np.testing.assert_array_equal(vocabulary.whitening.projection, projection)

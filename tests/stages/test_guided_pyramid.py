@@ -1,24 +1,19 @@
-"""Guided pyramid matching as a stage: turned queries, files that others read, no needless work."""
+"""Guided pyramid matching as a stage: rotated queries, stored features, pairs that are retried."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Collection
 from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
-import corner
 import cv2
 import numpy as np
 import pytest
-from kapture.io.csv import kapture_from_dir
-from kapture.io.features import image_keypoints_from_file
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.images import read_image_rgb, write_image
@@ -31,28 +26,26 @@ from megloc_kapture.stages.guided_pyramid import (
     PyramidMethod,
     pyramid_mapping,
     pyramid_queries,
-    retry_query,
 )
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.matches import Features, match_pairs
+from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
-from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Pose, RigidTransform
 
 MAP_IMAGES = ("left/1.png", "right/2.png", "right/3.png")
 QUERIES = ("query/a.png", "query/b.png")
-TURNS = (0, 90, 270)  # the map has an image that is turned, and there are turned queries
+TURNS = (0, 90, 270)  # one map image and the queries of ``turned`` are rotated
 ALL = GuidedPyramidOptions(mode="all", scales=(0.5, 1.0), rotations_deg=TURNS)
 MAX = GuidedPyramidOptions(mode="max", scales=(0.5, 1.0), rotations_deg=TURNS)
-# counter-clockwise: what was to the right is at the top
+# counter-clockwise: the right side of the image becomes its top
 TURN = RigidTransform.from_matrix(
     np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)
 )
 
 
 class Upright:
-    """Corners of one size with descriptors that turn with the image: it knows no other pose."""
+    """Corners of one size whose descriptors are not invariant to rotation."""
 
     name = "upright"
     metric = "L2"
@@ -64,7 +57,7 @@ class Upright:
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
         self.calls += 1
-        assert self.calls <= self.most, "extracted again, although no pair asks for it"
+        assert self.calls <= self.most, "extracted again without need"
         if min(image.shape[:2]) < 100:
             raise DataError("smaller than 100 pixels")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -82,7 +75,7 @@ NEVER = Upright(most=0)
 
 
 class Scene:
-    """The corner's map, and its queries turned or as they are, matched by upright features."""
+    """A map of the corner and its queries, rotated or not, matched by upright features."""
 
     def __init__(self, root: Path, world: Any) -> None:
         self.root, self.world = root, world
@@ -95,11 +88,11 @@ class Scene:
         return self.folder("mapping")
 
     def larger(self, name: str) -> KaptureFolder:
-        """With what all variants added."""
+        """Return the folder with the features that all variants added."""
         return KaptureFolder(self.root / name, features_dirs=[self.root / f"{name}_all"])
 
     def pairs(self, name: str) -> list[ImagePair]:
-        """Of the mapping images, or of queries with them."""
+        """Return the pairs of mapping images, or of queries and mapping images."""
         if name == "mapping":
             return [ImagePair(*pair, 1.0) for pair in combinations(MAP_IMAGES, 2)]
         queries = self.folder(name).read().image_names()
@@ -113,23 +106,23 @@ class Scene:
         mapping: KaptureFolder | None = None,
         query: KaptureFolder | None = None,
         pairs: list[ImagePair] | None = None,
-        work: Work = HERE,
         num_found: dict[tuple[str, str], int] | None = None,
         **more: Any,
     ) -> dict[str, float]:
         mapping, pairs = mapping or self.mapping(), pairs or self.pairs(name)
-        beside: Any = {"num_found": num_found, "work": work}
         with single_threaded():
             if name == "mapping":
                 how = method(**{"verification": KnownPoseOptions()} | more)
-                return pyramid_mapping(mapping, pairs, "upright", how, output, **beside)
+                return pyramid_mapping(mapping, pairs, "upright", how, output, num_found=num_found)
             query = query or self.folder(name)
             how = method(**more)
-            return pyramid_queries(query, mapping, pairs, "upright", how, output, **beside)
+            return pyramid_queries(
+                query, mapping, pairs, "upright", how, output, num_found=num_found
+            )
 
 
 def method(**more: Any) -> PyramidMethod:
-    """How pairs are tried again: by upright features, unless another extractor is given."""
+    """Return a pyramid method with upright features by default."""
     how = {"extractor": Upright(), "matcher": NearestNeighbours()}
     return PyramidMethod(**how | {"verification": TwoViewOptions(), "options": ALL} | more)
 
@@ -141,7 +134,7 @@ def write_images(
     turned: Collection[str],
     prefix: str = "",
 ) -> None:
-    """Images of ``source``, some of them turned, as a kapture of their own."""
+    """Write images of ``source``, some of them rotated, as a kapture folder."""
     data = KaptureData()
     for number, (image, pose) in enumerate(sorted(poses.items())):
         camera = source.read().camera_of(image)
@@ -183,7 +176,7 @@ def scene(images_only: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
-    """Share of the queries that the map's upright images localize."""
+    """Return the share of queries that are localized by the upright map images."""
     truth = query.read().poses()
     pairs = [ImagePair(image, other, 1.0) for image in truth for other in MAP_IMAGES[:2]]
     types, options = ["upright-pyramid"], LocalizationOptions()
@@ -196,17 +189,16 @@ def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
     return float(np.mean(near))
 
 
-# ---------------------------------------------------------------------------- what it gains
-
-
-def test_turned_queries_gain_and_are_localized(scene: Scene, tmp_path: Path) -> None:
-    # observed are keypoints of the pyramid, matched are those of the base: it begins with them
+def test_rotated_queries_gain_matches_and_are_localized(scene: Scene, tmp_path: Path) -> None:
     mapping = scene.larger("mapping")
     with single_threaded():
         how, made = TriangulationOptions(), tmp_path / "map"
-        triangulate_map(mapping, mapping, "upright-pyramid", made, how)
+        with pytest.raises(DataError, match="no point could be triangulated"):
+            triangulate_map(scene.mapping(), scene.mapping(), "upright", tmp_path / "base", how)
+        counts = triangulate_map(mapping, mapping, "upright-pyramid", made, how)
         off = scene.retry("turned", tmp_path / "off", options=GuidedPyramidOptions())
         more = scene.retry("turned", tmp_path / "max", options=MAX)
+    assert counts["observations"] > 100 and counts["mean_reprojection_error_px"] < 1.0
     assert off["pairs_tried"] == off["images_extracted_again"] == 0
     assert more["pairs_gained"] == 4
     found = {}
@@ -216,43 +208,7 @@ def test_turned_queries_gain_and_are_localized(scene: Scene, tmp_path: Path) -> 
     assert found["turned_all"] == found["max"] == 1.0 > found["off"]
 
 
-def test_added_keypoints_are_where_the_scene_is(scene: Scene) -> None:
-    # matched keypoints of a turned query and a map image see one point of the walls
-    query = scene.larger("turned")
-    other = "right/2.png"
-    camera, pose = scene.mapping().read().camera_of(other), scene.mapping().read().poses()[other]
-    for image in query.read().image_names():
-        rows, _ = query.matches("upright-pyramid").read(image, other)
-        px = query.keypoints("upright-pyramid").read(image)[rows[:, 0]]
-        other_px = scene.mapping().keypoints("upright").read(other)[rows[:, 1]]
-        column, line = other_px.T.astype(int)
-        in_cam = bearing_rays(camera, other_px)
-        in_cam *= (corner.depth_m(pose)[line, column] / in_cam[:, 2])[:, None]
-        points = pose.inverse().apply(in_cam)
-        seen = project(query.read().camera_of(image), query.read().poses()[image], points)
-        distance = np.linalg.norm(seen - px, axis=1)
-        assert np.median(distance) < 1.0
-        assert (distance < 6.0).mean() > 0.85  # a two-view model knows lines, not points
-
-
-def test_mapping_adds_to_both_images_and_gives_points(scene: Scene, tmp_path: Path) -> None:
-    larger = scene.larger("mapping")
-    with single_threaded():
-        # before, no point has enough matches
-        with pytest.raises(DataError, match="no point could be triangulated"):
-            triangulate_map(
-                scene.mapping(), scene.mapping(), "upright", tmp_path / "a", TriangulationOptions()
-            )
-        after = triangulate_map(
-            larger, larger, "upright-pyramid", tmp_path / "b", TriangulationOptions()
-        )
-    assert after["observations"] > 100
-    assert after["mean_reprojection_error_px"] < 1.0
-
-
-def test_queries_meet_the_keypoints_that_were_added_to_the_map(
-    scene: Scene, tmp_path: Path
-) -> None:
+def test_queries_are_matched_with_keypoints_added_to_the_map(scene: Scene, tmp_path: Path) -> None:
     larger = scene.folder("mapping", "mapping_all")
     seen: set[int] = set()
 
@@ -265,16 +221,12 @@ def test_queries_meet_the_keypoints_that_were_added_to_the_map(
     assert counts["pairs_gained"] >= 4
     keypoints = larger.keypoints("upright-pyramid")
     assert seen <= {keypoints.length(image) for image in MAP_IMAGES}
-    own = scene.mapping().keypoints("upright")
-    assert not seen <= {own.length(image) for image in MAP_IMAGES}
-    assert larger.keypoints("upright-pyramid").names == sorted(MAP_IMAGES)  # the map is not written
-
-
-# ---------------------------------------------------------------------------- what it leaves
+    base = scene.mapping().keypoints("upright")
+    assert not seen <= {base.length(image) for image in MAP_IMAGES}
 
 
 @pytest.mark.parametrize("kind", ["turned", "mapping"])
-def test_every_index_of_the_base_type_is_one_of_the_pyramid(scene: Scene, kind: str) -> None:
+def test_features_of_the_base_type_keep_their_rows(scene: Scene, kind: str) -> None:
     base, larger = scene.folder(kind), scene.larger(kind)
     extended = 0
     for image in base.read().image_names():
@@ -292,34 +244,12 @@ def test_every_index_of_the_base_type_is_one_of_the_pyramid(scene: Scene, kind: 
     for pair in before.pairs:
         indices, scores = before.read(*pair)
         more, more_scores = after.read(*pair)
-        # by mode all, everything that was there stays
+        # mode all keeps the earlier matches
         np.testing.assert_array_equal(more[: len(indices)], indices)
         np.testing.assert_array_equal(more_scores[: len(indices)], scores)
 
 
-def test_kaptures_own_reader_opens_the_type(scene: Scene) -> None:
-    place = scene.root / "as_kapture"
-    shutil.copytree(scene.root / "mapping" / "sensors", place / "sensors")
-    for kind in ("keypoints", "descriptors", "matches"):
-        shutil.copytree(
-            scene.root / "mapping_all" / "local_features" / "upright-pyramid" / kind,
-            place / "reconstruction" / kind / "upright-pyramid",
-        )
-    read = kapture_from_dir(str(place))
-    assert set(read.keypoints["upright-pyramid"]) == set(MAP_IMAGES)
-    assert read.descriptors["upright-pyramid"].keypoints_type == "upright-pyramid"
-    expected, stored = KaptureFolder(place).keypoints("upright-pyramid"), read.keypoints
-    for image in MAP_IMAGES:
-        file = str(place / "reconstruction/keypoints/upright-pyramid" / f"{image}.kpt")
-        like = stored["upright-pyramid"].dtype, stored["upright-pyramid"].dsize
-        np.testing.assert_array_equal(image_keypoints_from_file(file, *like), expected.read(image))
-    assert set(read.matches["upright-pyramid"]) == set(combinations(MAP_IMAGES, 2))
-
-
-# ---------------------------------------------------------------------------- when it runs
-
-
-def test_the_mask_goes_with_the_image(
+def test_masks_apply_to_variants_and_small_variants_are_skipped(
     scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     root = tmp_path / "masked"
@@ -329,7 +259,6 @@ def test_the_mask_goes_with_the_image(
         mask[:, :100] = 0
         write_image(root / "sensors" / "masks" / f"{image}.png", mask)
     query = KaptureFolder(root, features_dirs=scene.folder("turned").features_dirs)
-    # and what is too small is skipped with its reason
     options = GuidedPyramidOptions(mode="all", scales=(0.2, 0.5, 1.0), rotations_deg=TURNS)
     scene.retry("turned", tmp_path / "out", query=query, mask_margin_px=10.0, options=options)
     larger = KaptureFolder(root, features_dirs=[tmp_path / "out"]).keypoints("upright-pyramid")
@@ -340,8 +269,7 @@ def test_the_mask_goes_with_the_image(
     assert "0.2@0 0.2@90 0.2@270: smaller than 100 pixels" in caplog.text
 
 
-def test_what_is_not_tried(scene: Scene, tmp_path: Path) -> None:
-    """Neither easy pairs, nor those without a pose or that look away from each other."""
+def test_easy_pairs_and_impossible_pairs_are_not_retried(scene: Scene, tmp_path: Path) -> None:
     options = GuidedPyramidOptions(mode="all", min_matches=40)
     pairs = [pair for pair in scene.pairs("easy") if pair.map != "right/3.png"]
     easy = scene.retry("easy", tmp_path / "easy", pairs=pairs, extractor=NEVER, options=options)
@@ -361,32 +289,13 @@ def test_what_is_not_tried(scene: Scene, tmp_path: Path) -> None:
         counts = scene.retry("mapping", tmp_path / f"{name} out", mapping=folder, extractor=NEVER)
         assert counts["pairs"] == 3
         assert counts["pairs_tried"] == counts["images_extracted_again"] == 0
-    pairs = [ImagePair("query/a.png", "left/0.png", 1.0)]
-    with pytest.raises(DataError, match=r"no matches .* 'query/a.png' and 'left/0.png'"):
-        scene.retry("easy", tmp_path / "missing", pairs=pairs)
-
-
-def test_one_query_whose_pairs_are_easy_is_never_read(scene: Scene) -> None:
-    def never(*_: str) -> Any:
-        raise AssertionError("read, although all pairs are easy")
-
-    query, image = scene.folder("easy"), "query/a.png"
-    read = (kind("upright").read(image) for kind in (query.keypoints, query.descriptors))
-    own = Features.of(query.read().camera_of(image), *read)
-    rows = np.stack([np.arange(100)] * 2, axis=1)
-    for options in (ALL, GuidedPyramidOptions(min_matches=1000)):
-        how = method(extractor=NEVER, options=options)
-        found = retry_query(own, [("left/1.png", rows, np.ones(100))], never, how, never)
-        assert len(found.added_px) == len(found.added_descriptors) == len(found.tried) == 0
-        assert [(other, len(own)) for other, own, _ in found.matches] == [("left/1.png", 100)]
 
 
 @pytest.mark.parametrize("kind", ["mapping", "easy"])
 @pytest.mark.parametrize(("more", "tried"), [(0, False), (1, True)])
-def test_a_pair_with_as_many_matches_as_asked_for_is_left(
+def test_a_pair_with_exactly_min_matches_is_not_retried(
     scene: Scene, tmp_path: Path, kind: str, more: int, tried: bool
 ) -> None:
-    """Fewer than so many, MegLoc says: with exactly so many nothing is tried again."""
     matches = scene.folder(kind).matches("upright")
     least = min(len(matches.read(p.query, p.map)[0]) for p in scene.pairs(kind))
     options = ALL.model_copy(update={"min_matches": least + more})
@@ -394,11 +303,11 @@ def test_a_pair_with_as_many_matches_as_asked_for_is_left(
 
 
 @pytest.mark.parametrize("kind", ["mapping", "turned"])
-def test_matches_before_verification_decide_where_they_are_counted(
+def test_pairs_are_retried_by_the_matches_that_are_counted(
     scene: Scene, tmp_path: Path, kind: str
 ) -> None:
     stored = scene.folder(kind).matches("upright")
-    # all but one pair have 100 matches that verification does not leave
+    # all pairs but one have 100 matches before verification
     found = {(p.query, p.map): 100 for p in scene.pairs(kind)}
     hard = {pair for pair in found if len(stored.read(*pair)[0]) < 100}
     few = max(hard)
@@ -408,15 +317,3 @@ def test_matches_before_verification_decide_where_they_are_counted(
         counts = scene.retry(kind, tmp_path / count, options=options, num_found=found)
         assert counts["pairs_tried"] == len(expected)
     assert len(hard) > 1
-
-
-@pytest.mark.parametrize("kind", ["mapping", "turned"])
-def test_without_verification_every_match_of_a_variant_is_kept(
-    scene: Scene, tmp_path: Path, kind: str
-) -> None:
-    one_turn = GuidedPyramidOptions(mode="max", scales=(1.0,), rotations_deg=(270,))
-    none = {"verification": None}
-    unverified = scene.retry(kind, tmp_path / "none", options=one_turn, **none)
-    verified = scene.retry(kind, tmp_path / "verified", options=one_turn)
-    assert unverified["pairs_tried"] == verified["pairs_tried"] > 0
-    assert unverified["matches_after"] > verified["matches_after"]

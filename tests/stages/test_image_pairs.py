@@ -1,7 +1,8 @@
-"""Pairs of the small world against all similarities and all poses."""
+"""Pairs of the small scene, against rankings and counts made by hand."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import combinations, pairwise, product
 from pathlib import Path
@@ -9,24 +10,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.geometry.poses import movement
-from megloc_kapture.io.dataset_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_priors
 from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureData,
     KaptureFolder,
     MatchesWriter,
-    read_pairs,
     write_observations,
-    write_pairs,
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.tables import PairCount, match_counts_path, write_match_counts
+from megloc_kapture.io.tables import PairCount, write_match_counts
 from megloc_kapture.mapping import pairs as pairs_module
+from megloc_kapture.retrieval.search import FusionOptions, fuse
 from megloc_kapture.stages.image_pairs import (
+    UNRESTRICTED,
     MappingPairsOptions,
     QueryPairsOptions,
     RerankingOptions,
@@ -39,7 +40,7 @@ from megloc_kapture.stages.image_pairs import (
     reranked,
     vectors_of,
 )
-from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
+from megloc_kapture.stages.matches import VerifiedMatches
 
 VECTORS = {
     # two copies, one near them, one across, one opposite
@@ -80,7 +81,7 @@ def names(pairs: list[Any]) -> list[tuple[str, str]]:
     return [(pair.query, pair.map) for pair in pairs]
 
 
-@pytest.mark.parametrize("top_k", [1, 2, 3, 30])
+@pytest.mark.parametrize("top_k", [1, 2, 30])
 def test_map_pairs_by_retrieval(world: Any, folders: Folders, top_k: int) -> None:
     images = sorted(world.map_poses)
     expected = {}
@@ -97,30 +98,18 @@ def test_map_pairs_by_retrieval(world: Any, folders: Folders, top_k: int) -> Non
     assert ("left/0.png", "left/1.png") in expected  # copies of each other
 
 
-def test_copies_do_not_take_more_places_than_there_are(
-    world: Any, write_features: Any, tmp_path: Path
-) -> None:
-    copies = dict.fromkeys(world.map_poses, np.ones(3, np.float32))
-    write_features(tmp_path, "global_features", "toy", copies)
-    first, *others = sorted(world.map_poses)
-    # each has one partner, the first of the others
-    found = paired(world.mapping().with_features([tmp_path]), top_k=1)
-    assert names(found) == [(first, other) for other in others]
-
-
-@pytest.mark.parametrize("by", [("exhaustive", "retrieval"), ("retrieval", "exhaustive")])
-def test_methods_add_up_and_retrieval_gives_the_score(folders: Folders, by: Any) -> None:
-    found = paired(folders[0], by=by, top_k=1)
+def test_methods_are_combined_and_retrieval_gives_the_score(folders: Folders) -> None:
+    found = paired(folders[0], by=("exhaustive", "retrieval"), top_k=1)
     assert names(found) == list(combinations(sorted(VECTORS)[:2] + sorted(VECTORS)[4:], 2))
     scores = {(pair.query, pair.map): pair.score for pair in found}
     assert scores["left/0.png", "left/1.png"] == pytest.approx(1.0, abs=1e-6)
     expected = similarity("left/0.png", "right/2.png")
     assert scores["left/0.png", "right/2.png"] == pytest.approx(expected, abs=1e-6)
-    assert scores["left/0.png", "right/4.png"] == 1.0  # named by no retrieval
+    assert scores["left/0.png", "right/4.png"] == 1.0  # retrieval does not name it
 
 
 def shared_points(folder: KaptureFolder) -> dict[tuple[str, str], int]:
-    """Number of points that two images observe both, counted with sets."""
+    """Count the points that two images share, with sets."""
     seen: dict[str, set[int]] = {}
     for observations in folder.observations().values():
         for point, image in zip(observations.point_ids, observations.image_ids, strict=True):
@@ -128,40 +117,25 @@ def shared_points(folder: KaptureFolder) -> dict[tuple[str, str], int]:
     return {(a, b): len(seen[a] & seen[b]) for a, b in combinations(sorted(seen), 2)}
 
 
-def test_map_pairs_by_covisibility(world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    shared = shared_points(world.map())
-    least = sorted(shared.values())[5]
-    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", least)
-    options = {"by": ("covisibility",)}
-    expected = sorted(pair for pair, count in shared.items() if count >= least)
-    assert 0 < len(expected) < 10
-    found = paired(world.map(), **options)
-    assert names(found) == expected and {pair.score for pair in found} == {1.0}
-    # images of one kapture, points of another
-    assert paired(world.mapping(), world.map(), **options) == found
-    with pytest.raises(DataError, match="mapping: no map to pair images by co-visibility"):
-        paired(world.mapping(), **options)
-
-
-def test_points_of_all_types_count(
+def test_map_pairs_by_covisibility_count_points_of_all_types(
     world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two images that share points of two types share the sum."""
     seen, points = world.map().observations()["rootsift"], world.map().points3d()
-    again = replace(seen, keypoints_type="other", point_ids=seen.point_ids + len(points))
+    other = replace(seen, keypoints_type="other", point_ids=seen.point_ids + len(points))
     write_sensors(tmp_path, world.map().read())
     write_points3d(tmp_path, np.concatenate([points] * 2))
-    write_observations(tmp_path, {"rootsift": seen, "other": again})
-    shared = shared_points(world.map())
-    most = max(shared.values())
-    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", 2 * most)
-    found = paired(KaptureFolder(tmp_path), by=("covisibility",))
-    assert names(found) == sorted(pair for pair, count in shared.items() if count == most)
-    # a map of other images
-    strangers = replace(seen, image_names=tuple(f"{k}.jpg" for k in range(5)))
-    write_observations(tmp_path, {"rootsift": strangers})
-    with pytest.raises(DataError, match="no image to be paired observes its points"):
-        paired(world.mapping(), KaptureFolder(tmp_path), by=("covisibility",))
+    write_observations(tmp_path, {"rootsift": seen, "other": other})
+    two_types = KaptureFolder(tmp_path)
+    shared = shared_points(two_types)
+    least = sorted(shared.values())[5]
+    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", least)
+    found = paired(two_types, by=("covisibility",))
+    expected = sorted(pair for pair, count in shared.items() if count >= least)
+    assert names(found) == expected and {pair.score for pair in found} == {1.0}
+    # images of one folder, points of another
+    assert paired(world.mapping(), two_types, by=("covisibility",)) == found
+    with pytest.raises(DataError, match="mapping: no map to pair images by co-visibility"):
+        paired(world.mapping(), by=("covisibility",))
 
 
 def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -> None:
@@ -206,23 +180,11 @@ def test_frames_never_mix(world: Any, folders: Folders, by: Any) -> None:
     within = [pair for pair in combinations(images, 2) if len({*map(FRAMES.frame, pair)}) == 1]
     assert 0 < len(within) < 10
     assert set(names(found)) <= set(within)
-    # the best of its own frame is found though a better one stands in the other
+    # the best image of the same frame is paired although the other frame has a better match
     assert {image for pair in names(found) for image in pair} == set(images)
 
 
-def test_all_methods_together_name_each_pair_once(world: Any, folders: Folders) -> None:
-    methods = ("sequence", "covisibility", "poses", "retrieval")
-    options: dict[str, Any] = {"top_k": 1, "covisibility": {"top_k": 1}}
-    options |= {"sequence": {"window": 1}, "poses": {"num_neighbours": 1}}
-    together, *alone = (
-        names(paired(folders[0], world.map(), by=by, **options))
-        for by in (methods, *((method,) for method in methods))
-    )
-    assert together == sorted(set().union(*alone))
-    assert len(together) > max(map(len, alone))
-
-
-def test_query_pairs_are_best_first(folders: Folders) -> None:
+def test_query_pairs_are_sorted_by_similarity(folders: Folders) -> None:
     found = pair_queries(*folders, QueryPairsOptions(top_k=3), retrieval=BY_TOY)
     assert names(found) == [
         ("query/a.png", "right/2.png"),
@@ -239,15 +201,6 @@ def test_query_pairs_are_best_first(folders: Folders) -> None:
     assert names(everything) == list(product(queries, images))
 
 
-def test_vlad_ranks_the_nearest_view_first(world: Any) -> None:
-    found = world.query_pairs()
-    for query, pose in world.query_poses.items():
-        ranked = [pair.map for pair in found if pair.query == query]
-        assert len(ranked) == 5
-        distance = {m: movement(p, pose)[0] for m, p in world.map_poses.items()}
-        assert ranked[0] in sorted(distance, key=distance.__getitem__)[:2]
-
-
 def test_images_without_global_features_are_named(world: Any) -> None:
     reader = world.mapping().global_features("vlad_rootsift")
     with pytest.raises(DataError, match=r"2 images have no .* vlad_rootsift, the first is x\.png"):
@@ -258,19 +211,6 @@ def test_images_without_global_features_are_named(world: Any) -> None:
         pair_queries(world.mapping(), world.query(), QueryPairsOptions(), retrieval=None)
 
 
-def test_global_features_come_at_unit_length_and_zero_stays_zero(
-    write_features: Any, tmp_path: Path
-) -> None:
-    vectors = {"a.png": np.array([3.0, 4.0]), "b.png": np.zeros(2)}
-    write_features(tmp_path, "global_features", "toy", vectors)
-    folder = KaptureFolder(tmp_path / "none", features_dirs=[tmp_path])
-    (source,) = vectors_of([folder.global_features("toy")], list(vectors))
-    np.testing.assert_allclose(source.read(0, 2), [[0.6, 0.8], [0, 0]])
-
-
-# -------------------------------------------------------------------------------------- reranking
-
-
 PAIRS = [
     *(ImagePair("q1", image, 0.9 - 0.1 * rank) for rank, image in enumerate("zyxw")),
     *(ImagePair("q2", image, 0.3 - 0.1 * rank) for rank, image in enumerate("xy")),
@@ -278,7 +218,7 @@ PAIRS = [
 
 
 def write_matches(root: Path, counts: dict[tuple[str, str], tuple[int, int]], name: str) -> None:
-    """Matches and their table: of each pair how many were found and verified."""
+    """Write matches and the table of their counts (all, verified) by pair."""
     table = []
     with MatchesWriter(root, name, orphan=True) as writer:
         for (image, other), (found, verified) in counts.items():
@@ -289,17 +229,13 @@ def write_matches(root: Path, counts: dict[tuple[str, str], tuple[int, int]], na
 
 
 def run(root: Path, names: str, by: Any, keep: int) -> dict[str, list[tuple[str, int]]]:
-    """Of each query the images that stay, and what they have."""
+    """Return the images that each query keeps, with their counts."""
     query = KaptureFolder(root, features_dirs=[root])
     found = reranked(PAIRS, query, root, list(names), RerankingOptions(by=by, keep=keep))
-    write_pairs(root / "pairs.txt", found)
-    assert dict(iterate_candidates(read_pairs(root / "pairs.txt"))) == {
-        q: [pair.map for pair in found if pair.query == q] for q in ("q1", "q2")
-    }, "the order in the file is another"
     return {q: [(p.map, int(p.score)) for p in found if p.query == q] for q in ("q1", "q2")}
 
 
-def test_most_correspondences_first_and_no_more_than_asked(tmp_path: Path) -> None:
+def test_candidates_are_ranked_by_their_matches(tmp_path: Path) -> None:
     counts = {("q1", "w"): (40, 30), ("q1", "y"): (50, 10), ("q2", "y"): (4, 4)}
     write_matches(tmp_path, counts, "a")
     assert run(tmp_path, "a", "verified", 3) == {
@@ -313,22 +249,13 @@ def test_most_correspondences_first_and_no_more_than_asked(tmp_path: Path) -> No
     equal = run(tmp_path, "b", "verified", 4)
     assert equal == {"q1": [("z", 7), ("x", 7), ("y", 0), ("w", 0)], "q2": [("x", 0), ("y", 0)]}
     assert run(tmp_path, "ab", "matches", 3)["q1"] == [("y", 50), ("w", 40), ("z", 7)]
-    write_matches(tmp_path, {("q1", "z"): (4, 3)}, "c")
-    assert run(tmp_path, "bc", "verified", 2)["q1"] == [("z", 10), ("x", 7)]
-    # nothing is reranked unless asked
-    assert not RerankingOptions().reranks()
-    assert rerank([[3, 9], [0, 0]], RerankingOptions()) == ([0, 1], [3, 9])
+    # reranking is off by default
     assert reranked(PAIRS, KaptureFolder("none"), Path("none"), ["a"], RerankingOptions()) == PAIRS
-    # a broken table is named with its line
-    path = match_counts_path(tmp_path, "a")
-    path.write_text(path.read_text() + "q,n,many,1\n")
-    with pytest.raises(DataError, match=r"match_counts\.csv:5: matches: "):
-        run(tmp_path, "a", "verified", 1)
     with pytest.raises(DataError, match=r"match_counts\.csv"):
         run(tmp_path, "n", "verified", 1)
 
 
-def test_one_type_may_count_alone(tmp_path: Path) -> None:
+def test_one_local_type_can_be_chosen_for_reranking(tmp_path: Path) -> None:
     write_matches(tmp_path, {("q1", "w"): (9, 9), ("q1", "y"): (1, 1)}, "superpoint-mine")
     write_matches(tmp_path, {("q1", "y"): (30, 20), ("q1", "z"): (3, 3)}, "aslfeat")
     query, types = KaptureFolder(tmp_path, features_dirs=[tmp_path]), ["superpoint-mine", "aslfeat"]
@@ -336,14 +263,10 @@ def test_one_type_may_count_alone(tmp_path: Path) -> None:
     for name, image in first.items():
         options = RerankingOptions(by="verified", local_type=name)
         assert reranked(PAIRS, query, tmp_path, types, options)[0].map == image
-    # the name of a type goes before that of a plugin, and a pyramid's is that of its base
-    options = RerankingOptions(by="verified", local_type="sift")
-    assert options.counted_types(["sift-mine", "sift-pyramid"]) == ["sift-pyramid"]
     unknown = RerankingOptions(by="verified", local_type="superpint")
     message = r"reranking\.local_type: no local features of type 'superpint'; did you mean"
     with pytest.raises(OptionError, match=message):
         reranked(PAIRS, query, tmp_path, types, unknown)
-    assert RerankingOptions(local_type="superpint").counted_types(types) == types  # it is off
 
 
 def test_coverage_counts_each_keypoint_once(tmp_path: Path) -> None:
@@ -353,14 +276,76 @@ def test_coverage_counts_each_keypoint_once(tmp_path: Path) -> None:
             both = np.stack([rows, np.arange(len(rows))], axis=1).astype(np.int64)
             writer.write("q1", image, both, np.ones(len(rows)))
     assert run(tmp_path, "a", "coverage", 3)["q1"] == [("z", 4), ("x", 2), ("y", 0)]
-    # the same from arrays
-    of_image = [np.array(matched[image], np.int64) for image in ("z", "y", "x", "w")]
-    assert rerank([of_image], RerankingOptions(by="coverage", keep=3)) == ([0, 2, 1], [4, 2, 0])
     pair = VerifiedMatches(np.array([[3, 0], [5, 1]]), np.ones(2, np.float32), num_found=9)
     assert (counted(pair, "matches"), counted(pair, "verified")) == (9, 2)
     assert np.asarray(counted(pair, "coverage")).tolist() == [3, 5]
-    # row 1 of one type of keypoints is no row of the other
+    # row 1 of one type is another keypoint than row 1 of the other type
     of_types = [[np.array([2]), np.array([1])], [np.array([1, 2]), np.array([1, 3])]]
     options = RerankingOptions(by="coverage", keep=2)
     assert rerank(of_types, options) == ([0, 1], [3, 2])
-    assert rerank([[np.array([0]), np.array([0])]], options) == ([0, 1], [1, 0])
+
+
+def test_several_global_features_are_fused_with_their_weights(
+    world: Any, folders: Folders, write_features: Any, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(4)
+    images = [*sorted(world.map_poses), *sorted(world.query_poses)]
+    other = {image: rng.normal(size=8).astype(np.float32) for image in images}
+    write_features(tmp_path, "global_features", "other", other)
+    fusion = FusionOptions(method="mean")
+    retrieval = Retrieval(("toy", "other"), (1.0, 3.0), fusion)
+    found = pair_queries(*folders, QueryPairsOptions(top_k=2), retrieval=retrieval)
+
+    def cosines(vectors: Mapping[str, Any]) -> NDArray[np.float64]:
+        rows = np.array([vectors[image] / np.linalg.norm(vectors[image]) for image in images])
+        return rows[5:] @ rows[:5].T
+
+    fused = fuse([cosines(VECTORS), cosines(other)], fusion, (1.0, 3.0))
+    best = np.argsort(-fused, axis=1)[:, :2]
+    expected = [(images[5 + q], images[m]) for q in range(2) for m in best[q]]
+    assert names(found) == expected
+    scores = [fused[q, m] for q in range(2) for m in best[q]]
+    np.testing.assert_allclose([pair.score for pair in found], scores, atol=1e-6)
+
+
+IMAGES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+GROUPS = {
+    "a.jpg": ImageGroup(location="001/rear", frame="DUC1"),
+    "b.jpg": ImageGroup(location="001/left", frame="DUC1"),
+    "c.jpg": ImageGroup(location="001/rear", frame="DUC2"),
+}
+
+
+def pools(restrictions: Restrictions, queries: list[str]) -> dict[str, list[int]]:
+    return {
+        queries[at]: images.tolist()
+        for positions, images in restrictions.pools(queries, IMAGES)
+        for at in positions
+    }
+
+
+def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
+    everything = {"free": [0, 1, 2, 3]}
+    assert (
+        pools(UNRESTRICTED, ["free"]) == pools(Restrictions.read(tmp_path), ["free"]) == everything
+    )
+    write_groups(tmp_path, GROUPS)
+    priors = {
+        "by location": ["001/rear"],
+        "by frame": ["DUC1"],
+        "by image": ["d.jpg"],
+        "by several": ["d.jpg", "001/rear", "a.jpg"],
+        "by nothing": ["099/rear"],
+    }
+    write_priors(tmp_path, priors)
+    frames = [members.tolist() for members in Restrictions(GROUPS).frames(IMAGES)]
+    assert frames == [[3], [0, 1], [2]]
+    assert [members.tolist() for members in UNRESTRICTED.frames(IMAGES)] == [[0, 1, 2, 3]]
+    assert pools(Restrictions.read(tmp_path), [*priors, "free"]) == {
+        "by location": [0, 2],
+        "by frame": [0, 1],
+        "by image": [3],
+        "by several": [0, 2, 3],
+        "by nothing": [],
+        "free": [0, 1, 2, 3],
+    }

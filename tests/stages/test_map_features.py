@@ -1,8 +1,7 @@
-"""A model without descriptors as a map: its points are moved to features extracted again."""
+"""Maps without descriptors: their points are moved to features that are extracted again."""
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +37,7 @@ TYPE = "rootsift"
 
 
 def published(source: KaptureFolder, root: Path, *, shift_px: float = 0.0) -> KaptureFolder:
-    """A map as a model is published that names only what sees points: fewer keypoints with other
-    numbers, in another order, and no descriptors."""
+    """Write a map without descriptors: only observed keypoints, in another order."""
     seen = source.observations()[TYPE]
     write_sensors(root, source.read())
     link_images(source.root, root)
@@ -60,21 +58,16 @@ def published(source: KaptureFolder, root: Path, *, shift_px: float = 0.0) -> Ka
     return KaptureFolder(root)
 
 
-def triples(folder: KaptureFolder, local_type: str = TYPE) -> set[tuple[int, str, int]]:
-    """Point, image, keypoint of every observation."""
-    seen = folder.observations()[local_type]
-    columns = np.stack([seen.point_ids, seen.image_ids, seen.keypoint_ids], axis=1)
-    return {(point, seen.image_names[row], keypoint) for point, row, keypoint in columns.tolist()}
-
-
-def place(folder: KaptureFolder, image: str, keypoint: int) -> tuple[float, ...]:
-    """Where a keypoint is."""
-    return tuple(_stored(folder, image)[keypoint].tolist())
-
-
-@lru_cache(maxsize=20)
-def _stored(folder: KaptureFolder, image: str) -> Any:
-    return folder.keypoints(TYPE).read(image)
+def observed(folder: KaptureFolder) -> set[tuple[tuple[float, ...], str, tuple[float, ...]]]:
+    """Return the point, image and keypoint coordinates of every observation."""
+    seen, points = folder.observations()[TYPE], folder.points3d()
+    found = set()
+    for row, image in enumerate(seen.image_names):
+        keypoints = folder.keypoints(TYPE).read(image)
+        rows = seen.image_ids == row
+        for point, keypoint in zip(seen.point_ids[rows], seen.keypoint_ids[rows], strict=True):
+            found.add((tuple(points[point].tolist()), image, tuple(keypoints[keypoint].tolist())))
+    return found
 
 
 def test_the_vocabulary_and_its_whitening_are_copied(world: Any, tmp_path: Path) -> None:
@@ -85,99 +78,70 @@ def test_the_vocabulary_and_its_whitening_are_copied(world: Any, tmp_path: Path)
     assert copy is not None and copy[0].size == 3 and copy[1].options == options
 
 
-def test_without_descriptors_the_observations_move_to_the_features_extracted_anew(
-    world, tmp_path: Path, folder_bytes: Any
-) -> None:
-    truth = world.map()
-    reference = published(truth, tmp_path / "reference")
+def test_observations_move_to_extracted_features(world: Any, tmp_path: Path) -> None:
+    truth, reference = world.map(), published(world.map(), tmp_path / "reference")
     counts = move_points(reference, world.mapping(), TYPE, tmp_path / "map")
-    assert counts["share_found_again"] == 1.0
     made = KaptureFolder(tmp_path / "map")
     made.validate()
-    assert made.types("descriptors") == [TYPE]
+    assert counts["share_found_again"] == 1.0
     np.testing.assert_array_equal(made.points3d(), truth.points3d())
-    # the features that see points, as they were extracted: each one's number there
-    number: dict[tuple[str, int], int] = {}
-    for image in made.keypoints(TYPE).names:
-        both = [
+    # further keypoints at almost equal coordinates are other orientations
+    assert observed(made) >= observed(truth)
+    assert len(observed(made)) < 1.01 * len(observed(truth))
+    for image in made.descriptors(TYPE).names:
+        stored, extracted = (
             np.hstack([folder.keypoints(TYPE).read(image), folder.descriptors(TYPE).read(image)])
-            for folder in (truth, made)
-        ]
-        row_of = {row.tobytes(): index for index, row in enumerate(both[0])}
-        assert len(row_of) == len(both[0]) > len(both[1])
-        number |= {(image, index): row_of[row.tobytes()] for index, row in enumerate(both[1])}
-    expected = triples(truth)
-    found = {(point, image, number[image, keypoint]) for point, image, keypoint in triples(made)}
-    assert expected <= found
-    # what is more are other orientations of the same places
-    where: dict[tuple[int, str], list[tuple[float, ...]]] = {}
-    for point, image, keypoint in expected:
-        where.setdefault((point, image), []).append(place(truth, image, keypoint))
-    extra = found - expected
-    assert 0 < len(extra) < 0.5 * len(expected)
-    for point, image, keypoint in extra:
-        off = np.array(where[point, image]) - place(truth, image, keypoint)
-        assert np.linalg.norm(off, axis=1).min() < 0.1
+            for folder in (made, truth)
+        )
+        # observed keypoints only, as they were extracted
+        assert set(map(tuple, stored)) < set(map(tuple, extracted))
 
 
-def fewer(world: Any, root: Path, max_keypoints: int) -> KaptureFolder:
-    """The mapping images with fewer features than the map was made of."""
+def with_fewer_features(world: Any, root: Path, max_keypoints: int) -> KaptureFolder:
     extractor = RootSift(RootSiftOptions(max_keypoints=max_keypoints))
     extract_local_features([world.mapping()], extractor, root)
     return world.mapping().with_features([root])
 
 
-def test_what_is_not_found_again_is_left_out(world: Any, tmp_path: Path) -> None:
-    truth = world.map()
-    reference = published(truth, tmp_path / "reference")
-    some = fewer(world, tmp_path / "features", 450)
+def test_observations_without_a_feature_are_left_out(world: Any, tmp_path: Path) -> None:
+    truth, reference = world.map(), published(world.map(), tmp_path / "reference")
+    some = with_fewer_features(world, tmp_path / "features", 450)
     counts = move_points(reference, some, TYPE, tmp_path / "map")
     made = KaptureFolder(tmp_path / "map")
     made.validate()
     keypoints = some.keypoints(TYPE)
     kept = {name: set(map(tuple, keypoints.read(name).tolist())) for name in keypoints.names}
-    seen = triples(truth)
-    there = [(p, image) for p, image, k in seen if place(truth, image, k) in kept[image]]
-    assert 0.5 < counts["share_found_again"] < 1
-    assert counts["share_found_again"] == pytest.approx(len(there) / len(seen), abs=0.02)
-    # points are numbered anew, without those that nothing sees any more
+    expected = {row for row in observed(truth) if row[2] in kept[row[1]]}
+    assert observed(made) >= expected and len(observed(made)) < 1.05 * len(expected)
+    share = len(expected) / len(observed(truth))
+    assert counts["share_found_again"] == pytest.approx(share, abs=0.02) and 0.5 < share < 1
+    # points without observations are removed and the others numbered again
     points = made.points3d()
     assert counts["points"] == len(points) < len(truth.points3d())
     assert set(made.observations()[TYPE].point_ids.tolist()) == set(range(len(points)))
-    # by coordinates, as their numbers are others
-    expected = {(tuple(truth.points3d()[point].tolist()), image) for point, image in there}
-    found = {(tuple(points[point].tolist()), image) for point, image, _ in triples(made)}
-    assert found >= expected
-    assert len(found) < 1.05 * len(expected)
 
 
 def test_a_map_of_other_features_is_refused(world: Any, tmp_path: Path) -> None:
     reference = published(world.map(), tmp_path / "reference")
-    some = fewer(world, tmp_path / "features", 100)
+    some = with_fewer_features(world, tmp_path / "features", 100)
     with pytest.raises(DataError, match=r"only \d+% have a keypoint that extracting rootsift"):
         move_points(reference, some, TYPE, tmp_path / "map")
     assert not (tmp_path / "map").exists()
 
 
-# ---------------------------------------------------------------------------- keypoints by place
-
-
-NOWHERE = np.zeros((0, 2), np.float32)
+NONE = np.zeros((0, 2), np.float32)
 
 
 @pytest.mark.parametrize(
     ("stored", "extracted", "rows"),
     [
         ([(1, 1), (5, 5), (9, 9)], [(9, 9.01), (1, 1), (7, 7), (20, 20)], [1, -1, 0]),
-        ([(1, 1), (5, 5)], [(1, 1), (5, 5)], [0, 1]),
-        # those at one place are joined in order
+        # keypoints at equal coordinates are joined in order
         ([(1, 1), (1, 1), (2, 2), (1, 1)], [(2, 2), (1, 1), (3, 3), (1, 1)], [1, 3, 0, -1]),
-        ([(1, 1)], NOWHERE, [-1]),
-        (NOWHERE, [(1, 1)], []),
-        (NOWHERE, NOWHERE, []),
+        ([(1, 1)], NONE, [-1]),
     ],
 )
-def test_rows_are_found_by_place(stored: Any, extracted: Any, rows: list[int]) -> None:
+def test_keypoints_are_found_by_coordinates(stored: Any, extracted: Any, rows: list[int]) -> None:
     found = rows_found_again(*(np.array(one, np.float32) for one in (stored, extracted)))
     assert found.dtype == np.int64 and found.tolist() == rows
 
@@ -189,11 +153,11 @@ def at_places(stored: Any, extracted: Any, shift: float) -> list[tuple[int, int]
     return list(zip(of.tolist(), rows.tolist(), strict=True))
 
 
-def test_all_orientations_of_the_nearest_place_are_found() -> None:
+def test_all_orientations_of_the_nearest_keypoint_are_found() -> None:
     stored = [(1, 1), (30, 30), (9, 9)]
     extracted = [(9, 9), (1.3, 1), (9.05, 9), (1.9, 1), (1.3, 1.02)]
-    # (1.9, 1) is near enough, but another place
+    # (1.9, 1) is within the limit, but is another keypoint
     assert at_places(stored, extracted, 1.0) == [(0, 1), (0, 4), (2, 0), (2, 2)]
     assert at_places(stored, extracted, 0.2) == [(2, 0), (2, 2)]
     assert at_places([(30, 30)], extracted, 0.2) == []
-    assert at_places(NOWHERE, [(1, 1)], 1.0) == at_places([(1, 1)], NOWHERE, 1.0) == []
+    assert at_places([(1, 1)], NONE, 1.0) == []

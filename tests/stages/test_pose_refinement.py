@@ -1,8 +1,7 @@
-"""Refined results: what is accepted, what stays and why, and what is left alone."""
+"""Pose refinement as a stage: accepted and rejected steps, and consistency of the map."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -31,13 +30,14 @@ from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_
 from megloc_kapture.stages.query_poses import write_localized
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from tests.worlds import folder_bytes
 
 COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 1 / 3])
 SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
 
 
 class Shift:
-    """Moves every pose by 0.25 along the axis, of one image it does not."""
+    """Moves every pose by 0.25 along the optical axis, but not that of image ``stays``."""
 
     def __init__(self, stays: str = "", name: str = "shift") -> None:
         self.stays, self.name = stays, name
@@ -61,7 +61,7 @@ class Shift:
 
 
 class Sure(Shift):
-    """The same, where held out map images say that it may, which their frames decide."""
+    """Moves poses in frames whose map is consistent; FRAMES has the inconsistency."""
 
     def __init__(self, require_consistent_map: bool = True) -> None:
         super().__init__(name="sure")
@@ -73,12 +73,12 @@ class Sure(Shift):
         return Displacement(0.02, 0.2, 3.0, 0.001, 0.01, off)
 
 
-# frame of a map image, and how far from consistent it is
+# frame of a map image: standardised error of held-out map images
 FRAMES = {"good": 1.0, "bad": 1e4}
 
 
 class Chosen(PoseRefinementOptions):
-    """Options with refiners of their own."""
+    """Options with given refiners."""
 
     refiners: tuple[Any, ...] = ()
 
@@ -102,8 +102,8 @@ def localized(world: Any, tmp_path: Path) -> KaptureFolder:
     return KaptureFolder(folder)
 
 
-def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
-    world: Any, localized: KaptureFolder, tmp_path: Path, folder_bytes: Any
+def test_refiners_are_applied_in_order_and_failures_stay(
+    world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
     first, second = sorted(world.query_poses)
     options = Chosen(refiners=(Shift(), Shift(stays=first), Shift()))
@@ -115,21 +115,20 @@ def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
     assert refined.keys() == {first}
     np.testing.assert_allclose(refined[first].translation, expected.translation)
     status = status_table(tmp_path / "out")
-    said = "shift: accepted; shift: nothing overlaps; shift: accepted"
-    assert status.refinement[first] == said
+    steps = "shift: accepted; shift: nothing overlaps; shift: accepted"
+    assert status.refinement[first] == steps
     assert (status.refinement[second], status.reason[second]) == ("", "too dark")
     steps = read_refinement(tmp_path / "out" / "refinement.csv", refined)[first]
     assert [step.accepted for step in steps] == [True, False, True]
     assert [step.moved_m for step in steps] == pytest.approx([0.25, 0, 0.25])
     assert steps[1].measures == {"overlap": 0.125}
-    # what was localized is as it was
     assert localized.read().poses()[first] == world.query_poses[first]
     with ThreadPoolExecutor(2) as executor:
         refine_poses(*arguments, tmp_path / "threads", options, work=Work(executor))
     assert folder_bytes(tmp_path / "out") == folder_bytes(tmp_path / "threads")
 
 
-def test_a_pose_that_stays_keeps_its_covariance(
+def test_rejected_refinements_keep_the_covariance(
     world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
     first = min(world.query_poses)
@@ -139,16 +138,9 @@ def test_a_pose_that_stays_keeps_its_covariance(
         refine_poses(world.mapping(), world.query(), localized, tmp_path / name, options)
         kept[name] = read_covariances(tmp_path / name / "covariance.csv")
     np.testing.assert_array_equal(kept["stays"][first], COVARIANCE)
-    assert kept["moved"] == {}  # this refiner does not know that of its poses
-
-
-def test_references_are_the_candidates_of_the_pose(
-    world: Any, localized: KaptureFolder, tmp_path: Path
-) -> None:
-    refiner, first = Shift(), min(world.query_poses)
-    options = Chosen(refiners=(refiner,))
-    refine_poses(world.mapping(), world.query(), localized, tmp_path / "out", options)
-    assert refiner.asked[first] == [min(world.map_poses)]
+    assert kept["moved"] == {}  # the refiner returns no covariance
+    # the references are the candidates of the pose
+    assert options.refiners[0].asked[first] == [min(world.map_poses)]
 
 
 def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_path: Path) -> None:
@@ -159,7 +151,7 @@ def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_pa
         PoseRefinementOptions(by=(PluginChoice(name="better"),)).make_refiners()
 
 
-def test_every_registered_refiner_says_why_a_query_without_depth_stays(
+def test_queries_without_depth_are_not_refined(
     world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
     first = min(world.query_poses)
@@ -174,12 +166,9 @@ def test_every_registered_refiner_says_why_a_query_without_depth_stays(
         assert poses[first] == localized.read().poses()[first]
 
 
-# -------------------------------------------------------------------------------- map consistency
-
-
 @pytest.fixture
 def folders(world: Any, small_kapture: Any, tmp_path: Path) -> tuple[KaptureFolder, ...]:
-    """A map of two frames, and two queries that were localized, one in each."""
+    """A map of two frames, and two localized queries, one in each."""
     image = next(iter(world.mapping().read().image_names()))
     pixels = read_image_rgb(world.mapping().image_path(image))
     pose = RigidTransform.identity()
@@ -201,7 +190,7 @@ RESTRICTIONS = Restrictions(
 )
 
 
-def test_each_coordinate_frame_is_judged_by_itself(folders: Any, tmp_path: Path) -> None:
+def test_each_coordinate_frame_has_its_consistency(folders: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = Chosen(refiners=(Sure(),))
     counts = refine_poses(*folders, out, options, restrictions=RESTRICTIONS)
@@ -218,20 +207,9 @@ def test_each_coordinate_frame_is_judged_by_itself(folders: Any, tmp_path: Path)
     bad, good = read_consistency(out / CONSISTENCY_FILE)
     assert (bad.frame, bad.images, bad.contradicting) == ("bad", 6, 6)
     assert (good.frame, good.contradicting, good.reason) == ("good", 0, "")
-    assert consistency_sentence(good).startswith(
-        "sure in good is used; 6 map images held out move by 0.02"
-    )
-    with ThreadPoolExecutor(2) as executor:
-        refine_poses(
-            *folders, tmp_path / "threads", options, restrictions=RESTRICTIONS, work=Work(executor)
-        )
-    for name in (CONSISTENCY_FILE, "refinement.csv", "status.csv"):
-        assert (out / name).read_bytes() == (tmp_path / "threads" / name).read_bytes()
-    shutil.rmtree(out)
-
-
-def test_a_refiner_that_does_not_ask_is_used_everywhere(folders: Any, tmp_path: Path) -> None:
+    assert consistency_sentence(good).startswith("sure in good is used; 6 map images held out")
+    # without the check the refiner is used everywhere
     options = Chosen(refiners=(Sure(require_consistent_map=False),))
-    counts = refine_poses(*folders, tmp_path / "out", options, restrictions=RESTRICTIONS)
+    counts = refine_poses(*folders, tmp_path / "all", options, restrictions=RESTRICTIONS)
     assert counts == {"queries": 2, "accepted_by_sure": 2}
-    assert not (tmp_path / "out" / CONSISTENCY_FILE).exists()
+    assert not (tmp_path / "all" / CONSISTENCY_FILE).exists()

@@ -1,4 +1,4 @@
-"""Queries of known pose, localized from stored matches; failures are marked, never invented."""
+"""Queries localized from stored matches, and the folder of their results."""
 
 from __future__ import annotations
 
@@ -7,38 +7,42 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, cast
 
+import kapture.io.csv
 import numpy as np
+import pandas
 import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import PluginError
-from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder
+from megloc_kapture.io.tables import (
+    CLUSTERS_FILE,
+    COVARIANCE_FILE,
+    POSES_FILE,
+    STATUS_FILE,
+    read_covariances,
+    read_status,
+)
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import ClusterOptions
 from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatches
-from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
-from megloc_kapture.matching.verification import TwoViewOptions
-from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseHypothesis, RankingScene
-from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
-    localize_from_matches,
     localize_query,
     localize_unit,
+    write_localized,
 )
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 
-def test_queries_are_localized_where_they_are(world: Any, two_processes: Executor) -> None:
+def test_queries_are_localized_accurately(world: Any, two_processes: Executor) -> None:
     results = world.localized()
     assert [result.name for result in results] == sorted(world.query_poses)
     for result in results:
@@ -51,21 +55,21 @@ def test_queries_are_localized_where_they_are(world: Any, two_processes: Executo
         delta = truth @ result.cam_from_world.inverse()
         vector = Rotation.from_matrix(delta.rotation_matrix()).as_rotvec()
         error = np.concatenate([vector, delta.translation])
-        # six degrees of freedom; the map's own errors are not in it, hence the room
+        # six degrees of freedom, with room for errors of the map
         assert error @ np.linalg.solve(result.covariance, error) < 100
-    there = world.localized(work=Work(two_processes))
-    for a, b in zip(results, there, strict=True):
+    in_processes = world.localized(work=Work(two_processes))
+    for a, b in zip(results, in_processes, strict=True):
         assert (a.cam_from_world, a.num_inliers) == (b.cam_from_world, b.num_inliers)
 
 
-def test_a_query_without_candidates_fails_and_says_so(world: Any) -> None:
+def test_a_query_without_candidates_fails(world: Any) -> None:
     only_b = [ImagePair("query/b.png", "right/2.png", 1.0)]
     first, second = world.localized(only_b)
     assert first == Failure("no map image is a candidate")
     assert isinstance(second, Pose) and second.candidates == ("right/2.png",)
 
 
-def test_a_query_with_too_few_inliers_fails_and_keeps_its_numbers(world: Any) -> None:
+def test_a_query_with_too_few_inliers_fails_and_keeps_its_counts(world: Any) -> None:
     for result in world.localized(pose=AbsolutePoseOptions(min_inliers=5000)):
         assert isinstance(result, Failure)
         assert "at least 5000 are needed" in result.reason
@@ -73,7 +77,7 @@ def test_a_query_with_too_few_inliers_fails_and_keeps_its_numbers(world: Any) ->
 
 
 class Brightness:
-    """Ranks by the query's brightness, and looks at what the map shows."""
+    """Ranks by the brightness of the query and reads the map images."""
 
     def score(self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene) -> np.ndarray:
         for hypothesis in hypotheses:
@@ -96,8 +100,8 @@ def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None
         world.localized(rank=PluginChoice(name="no-such"))
 
 
-class _Turns:
-    """A query whose pose gets surer with more candidates, and the counts that were asked for."""
+class Candidates:
+    """A query source whose pose becomes more confident with more candidates."""
 
     def __init__(self, count: int, in_turn: bool) -> None:
         self.candidates = [str(number) for number in range(count)]
@@ -119,18 +123,18 @@ class _Turns:
         (50, 0.9, False, [50]),
     ],
 )
-def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported(
+def test_candidates_are_added_until_the_pose_is_confident(
     count: int,
     sure: float | None,
     in_turn: bool,
     expected: list[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    source = _Turns(count, in_turn)
+    source = Candidates(count, in_turn)
 
     def solve(*_: Any, **__: Any) -> list[Pose]:
-        turns = {8: (0.99, 29), 16: (0.89, 30), 32: (0.9, 30)}
-        confidence, inliers = turns.get(source.asked[-1], (0.95, 99))
+        results = {8: (0.99, 29), 16: (0.89, 30), 32: (0.9, 30)}
+        confidence, inliers = results.get(source.asked[-1], (0.95, 99))
         return [Pose(RigidTransform.identity(), 100, inliers, confidence=confidence)]
 
     monkeypatch.setattr("megloc_kapture.stages.query_poses.localize_unit", solve)
@@ -146,7 +150,7 @@ def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported(
     assert source.asked == expected
 
 
-def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
+def test_map_points_of_an_image_are_those_it_observes(world: Any) -> None:
     folder = world.map()
     scene, xyz = KaptureScene(folder), folder.points3d()[:, :3]
     for image in sorted(world.map_poses):
@@ -159,78 +163,86 @@ def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
     assert scene.map_points("elsewhere.png").shape == (0, 3)
 
 
-@pytest.mark.slow
-def test_real_photographs_are_localized_within_a_centimetre(
-    shared_data: Path, make_map: Any, tmp_path: Path
-) -> None:
-    scene = shared_data / "scenes" / "fountain_p11"
-    extractor = RootSift(RootSiftOptions(max_keypoints=1500))
-    made = make_map(KaptureFolder(scene / "mapping"), extractor, tmp_path)
-    query = KaptureFolder(scene / "query", features_dirs=[tmp_path / "query"])
-    truth = KaptureFolder(scene / "query_gt").read().poses()
-    pairs = [ImagePair(q, m, 1.0) for q in truth for m in made.read().image_names()]
-    matcher, how, output = NearestNeighbours(), TwoViewOptions(), tmp_path / "query"
-    with single_threaded():
-        extract_local_features([query], extractor, output)
-        match_pairs(query, made, pairs, "rootsift", matcher, how, output)
-        options = LocalizationOptions()
-        results = localize_from_matches(made, query, query, pairs, ["rootsift"], options)
-        errors = [movement(truth[found.name], found.cam_from_world)[0] for found in results]
-    assert len(errors) == 4 and max(errors) < 0.01
-
-
-@pytest.mark.parametrize("first", ["wrong", "right"])
-def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) -> None:
-    """Two places that look alike; the query matches more of one, which may be retrieved last."""
-    rng = np.random.default_rng(0)
-    camera = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-    place = rng.uniform((-2, -2, 4), (2, 2, 8), (100, 3))
-    names, rows = ("right/1", "right/2", "wrong/1", "wrong/2"), np.arange(100)
-    index = MapIndex.build(
-        np.concatenate([place, place + [50.0, 0.0, 0.0]]), names, np.repeat(np.arange(4), 100),
-        np.tile(rows, 4), np.concatenate([rows, rows, rows + 100, rows + 100]),
-    )  # fmt: skip
-    truth = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.2, -0.1, 0.4))
-    matches = [
-        (name, np.stack([rows[:count]] * 2, axis=1), np.full(count, 0.9))
-        for name, count in zip(names, (80, 90, 60, 50), strict=True)
-    ]
-    seen = project(camera, truth, place).astype(np.float32)
-    (found,) = localize_unit(
-        [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
-        sorted(names, key=lambda name: not name.startswith(first)),
-        LocalizationOptions(),
-        frame_of=lambda _: "",
-        centers={
-            name: np.array([0.0 if name.startswith("right") else 50.0, 0.0, 0.0]) for name in names
-        },
-        ranker=load_plugin(POSE_RANKERS, "inliers"),
-        scene=cast(RankingScene, None),  # that ranker asks for no picture
-    )
-    assert isinstance(found, Pose)
-    assert len(found.clusters) == 2
-    np.testing.assert_allclose(found.cam_from_world.center(), truth.center(), atol=1e-5)
-
-
 @pytest.mark.parametrize(("frames", "clusters"), [(["", ""], 1), (["DUC1", "DUC2"], 2)])
-def test_places_whose_poses_agree_are_one_but_in_two_frames(
+def test_clusters_with_equal_poses_are_merged_within_a_frame(
     frames: list[str], clusters: int
 ) -> None:
     camera, rows = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)), np.arange(100)
     points = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 8), (100, 3))
     index = MapIndex.build(points, ("a", "b"), np.repeat([0, 1], 50), rows, rows)
-    truth = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.2, -0.1, 0.4))
+    pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.2, -0.1, 0.4))
     halves = zip("ab", np.split(rows, 2), strict=True)
-    matches = [(name, np.stack([own] * 2, axis=1), np.full(50, 0.9)) for name, own in halves]
-    seen = project(camera, truth, points).astype(np.float32)
+    matches = [(name, np.stack([half] * 2, axis=1), np.full(50, 0.9)) for name, half in halves]
+    seen_px = project(camera, pose, points).astype(np.float32)
     (found,) = localize_unit(
-        [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
+        [QueryView("q", camera, (TypedMatches(index, seen_px, matches),))],
         ["a", "b"],
         LocalizationOptions(clusters=ClusterOptions(by="poses", radius=1.0)),
         frame_of=dict(zip("ab", frames, strict=True)).__getitem__,
         centers={"a": np.zeros(3), "b": np.full(3, 9.0)},
         ranker=load_plugin(POSE_RANKERS, "inliers"),
-        scene=cast(RankingScene, None),
+        scene=cast(RankingScene, None),  # this ranker reads no image
     )
     assert isinstance(found, Pose)
     assert (len(found.clusters), found.num_matches) == (clusters, 100 // clusters)
+
+
+def test_localized_queries_are_written_as_kapture_and_tables(world: Any, tmp_path: Path) -> None:
+    results = world.localized()
+    write_localized(tmp_path, world.query(), results, timing=tmp_path / "timing.csv")
+    folder = KaptureFolder(tmp_path)
+    folder.validate(deep=True)
+    assert folder.read().poses() == {found.name: found.cam_from_world for found in results}
+    poses = pandas.read_csv(tmp_path / POSES_FILE, index_col="image")
+    for result in results:
+        pose, row = result.cam_from_world, poses.loc[result.name]
+        np.testing.assert_allclose(row[["qw", "qx", "qy", "qz"]].astype(float), pose.quat_wxyz)
+        np.testing.assert_allclose(row[["tx", "ty", "tz"]].astype(float), pose.translation)
+        centre = row[["center_x", "center_y", "center_z"]].astype(float)
+        np.testing.assert_allclose(centre, pose.center(), atol=1e-9)
+    theirs = kapture.io.csv.kapture_from_dir(str(tmp_path))
+    assert len(theirs.trajectories) == 2 and len(list(theirs.records_camera.key_pairs())) == 2
+    status = read_status(tmp_path / STATUS_FILE)
+    clusters = pandas.read_csv(tmp_path / CLUSTERS_FILE, index_col="image")
+    for result in results:
+        row = status[result.name]
+        assert (row.status, row.reason, row.fallback) == ("localized", "", "none")
+        assert (row.num_inliers, row.candidates) == (result.num_inliers, result.candidates)
+        ((_, chosen),) = clusters.loc[[result.name]].query("chosen == 'yes'").iterrows()
+        assert chosen.cluster == row.cluster and chosen.images == ",".join(result.candidates)
+        assert chosen.score > 100
+    covariances = read_covariances(tmp_path / COVARIANCE_FILE)
+    for result in results:
+        np.testing.assert_array_equal(covariances[result.name], result.covariance)
+    lines = (tmp_path / "timing.csv").read_text().splitlines()
+    assert lines[0] == "image,step,seconds"
+    assert {line.split(",")[1] for line in lines[1:]} >= {"reading", "estimation", "refinement"}
+
+
+def half_failed(world: Any) -> list[Pose | Failure]:
+    first, second = world.localized()
+    return [Failure("no map image matches", name=first.name), second]
+
+
+@pytest.mark.parametrize(
+    ("fallback", "retrieved", "has_fallback"),
+    [("none", True, False), ("retrieval", False, False), ("retrieval", True, True)],
+)
+def test_a_failed_query_has_no_pose_without_a_fallback(
+    world: Any, tmp_path: Path, fallback: Any, retrieved: bool, has_fallback: bool
+) -> None:
+    fallback_pose = world.map_poses["left/1.png"]
+    counts = write_localized(
+        tmp_path, world.query(), half_failed(world), fallback=fallback,
+        first_candidates={q: ("left/1.png", fallback_pose) for q in world.query_poses if retrieved},
+    )  # fmt: skip
+    assert counts == {"queries": 2, "localized": 1, "failed": 1, "fallbacks": int(has_fallback)}
+    written = KaptureFolder(tmp_path).read()
+    assert written.image_names() == sorted(world.query_poses)
+    assert written.poses().get("query/a.png") == (fallback_pose if has_fallback else None)
+    assert written.poses()["query/b.png"] != fallback_pose
+    status = read_status(tmp_path / STATUS_FILE)
+    a, b = status["query/a.png"], status["query/b.png"]
+    assert (a.status, a.reason, a.num_inliers) == ("failed", "no map image matches", 0)
+    assert a.fallback == ("retrieval" if has_fallback else "none")
+    assert (b.status, b.fallback) == ("localized", "none")

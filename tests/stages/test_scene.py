@@ -1,8 +1,11 @@
-"""Images of one moment on a rig: units, and poses against composing kapture's own pose objects."""
+"""Rigs and the map index: poses of other cameras, and an index shared by processes."""
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import kapture
 import numpy as np
@@ -10,8 +13,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import KaptureData, Sensor
-from megloc_kapture.stages.scene import depth_records, poses_through_rig, query_units
+from megloc_kapture.io.kapture import (
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    write_observations,
+    write_points3d,
+)
+from megloc_kapture.io.kapture.points import write_point_covariances
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.stages.scene import (
+    index_map,
+    open_index,
+    poses_through_rig,
+    query_units,
+    shared_index,
+    with_noise,
+    write_index,
+)
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))
@@ -24,7 +43,7 @@ def random_pose(seed: int) -> RigidTransform:
 
 @pytest.fixture
 def data() -> KaptureData:
-    """Two moments of a car with three cameras, one of which is missing later, and a telephone."""
+    """A car with three cameras at two timestamps, with one at a third, and a phone."""
     data = KaptureData(sensors={name: CAMERA for name in ("left", "rear", "right", "phone")})
     data.rigs["car"] = {name: random_pose(k) for k, name in enumerate(("left", "rear", "right"))}
     for timestamp in (1, 2):
@@ -38,7 +57,7 @@ def kaptures(pose: RigidTransform) -> kapture.PoseTransform:
     return kapture.PoseTransform(list(pose.quat_wxyz), list(pose.translation))
 
 
-def test_a_sibling_gives_its_pose_through_the_rig(data: KaptureData) -> None:
+def test_poses_are_carried_to_other_cameras_of_the_rig(data: KaptureData) -> None:
     left = random_pose(9)
     found = poses_through_rig(data, {"left/1.jpg": Pose(left, 20, 12)})
     sources = {image: source for image, (source, _) in found.items()}
@@ -48,13 +67,11 @@ def test_a_sibling_gives_its_pose_through_the_rig(data: KaptureData) -> None:
     pose = found["rear/1.jpg"][1]
     np.testing.assert_allclose(pose.translation, expected.t_raw, atol=1e-12)
     np.testing.assert_allclose(abs(np.dot(pose.quat_wxyz, expected.r_raw)), 1, atol=1e-12)
-    both = {"left/1.jpg": Pose(left, 20, 12), "right/1.jpg": Pose(random_pose(5), 20, 13)}
-    assert poses_through_rig(data, both)["rear/1.jpg"][0] == "right/1.jpg"
     data.rigs.clear()
     assert poses_through_rig(data, {"left/1.jpg": Pose(left, 20, 12)}) == {}
 
 
-def test_a_rig_on_a_rig_is_as_one(data: KaptureData) -> None:
+def test_nested_rigs_equal_one_rig(data: KaptureData) -> None:
     flat = query_units(data, rigs=True)
     localized = {"left/1.jpg": Pose(random_pose(9), 20, 12)}
     expected = poses_through_rig(data, localized)
@@ -62,36 +79,23 @@ def test_a_rig_on_a_rig_is_as_one(data: KaptureData) -> None:
     nested = {name: car.pop(name) @ front.inverse() for name in ("left", "rear")}
     data.rigs = {"car": {**car, "front": front}, "front": nested}
     for unit, other in zip(query_units(data, rigs=True), flat, strict=True):
-        assert [image for image, _ in unit] == [image for image, _ in other]
-        for (_, one), (_, same) in zip(unit, other, strict=True):
-            np.testing.assert_allclose(one.matrix(), same.matrix(), atol=1e-12)
+        for (image, pose), (other_image, expected_pose) in zip(unit, other, strict=True):
+            assert image == other_image
+            np.testing.assert_allclose(pose.matrix(), expected_pose.matrix(), atol=1e-12)
     found = poses_through_rig(data, localized)
     assert found.keys() == expected.keys()
-    for image, (source, pose) in found.items():
-        assert source == expected[image][0]
+    for image, (_, pose) in found.items():
         np.testing.assert_allclose(pose.matrix(), expected[image][1].matrix(), atol=1e-12)
-    data.sensors["depth"] = replace(CAMERA, sensor_type="depth")
-    data.rigs["car"]["depth"] = random_pose(7)
-    data.records_depth[1, "depth"] = "1.depth"
-    of_image = depth_records(data)
-    assert of_image.keys() == {"left/1.jpg", "rear/1.jpg", "right/1.jpg"}
-    to_depth = data.rigs["front"]["left"] @ front @ random_pose(7).inverse()
-    found_depth = of_image["left/1.jpg"].image_from_depth.matrix()
-    np.testing.assert_allclose(found_depth, to_depth.matrix(), atol=1e-12)
-    data.rigs["front"]["car"] = front
-    data.rigs["roof"] = {"car": front}
-    with pytest.raises(DataError, match="contains itself"):
-        query_units(data, rigs=True)
 
 
-def test_the_sibling_with_the_most_inliers_counts(data: KaptureData) -> None:
+def test_the_camera_with_most_inliers_gives_the_pose(data: KaptureData) -> None:
     inliers = {"left/1": 30, "right/1": 31, "left/2": 8, "right/2": 8, "phone/2": 400}
     localized = {f"{n}.jpg": Pose(random_pose(5), 500, count) for n, count in inliers.items()}
     sources = {image: source for image, (source, _) in poses_through_rig(data, localized).items()}
     assert sources == {"rear/1.jpg": "right/1.jpg", "rear/2.jpg": "left/2.jpg"}
 
 
-def test_units_are_images_or_the_cameras_of_a_moment(data: KaptureData) -> None:
+def test_units_are_images_or_the_cameras_of_a_rig(data: KaptureData) -> None:
     alone = query_units(data, rigs=False)
     same = RigidTransform.identity()
     assert alone == [((name, same),) for name in data.image_names()]
@@ -100,5 +104,89 @@ def test_units_are_images_or_the_cameras_of_a_moment(data: KaptureData) -> None:
     expected = [*of_car, ("left/3.jpg",), ("phone/1.jpg",), ("phone/2.jpg",)]
     assert [tuple(image for image, _ in unit) for unit in together] == expected
     assert [pose for _, pose in together[0]] == list(data.rigs["car"].values())
-    # the other cameras of the moment are missing: a camera by itself needs no rig
+    # a single camera needs no rig
     assert together[2] == (("left/3.jpg", same),)
+
+
+NAMES = ("a/é.jpg", "b\n.jpg", "c.jpg")
+ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids")
+
+
+def make_index(*, covariances: bool = False) -> MapIndex:
+    rng = np.random.default_rng(0)
+    images, keypoints, points = (rng.integers(0, n, 200) for n in (3, 50, 40))
+    known = rng.normal(size=(40, 6)) if covariances else None
+    xyz = rng.normal(size=(40, 3)) + 4e6
+    return MapIndex.build(xyz, NAMES, images, keypoints, points, known)
+
+
+def empty_index() -> MapIndex:
+    none = np.zeros(0, dtype=np.int64)
+    return MapIndex.build(np.zeros((0, 3)), (), none, none, none)
+
+
+@pytest.mark.parametrize(
+    "index", [make_index(), make_index(covariances=True), empty_index()], ids=str
+)
+def test_a_written_index_is_opened_without_reading_it(index: MapIndex, tmp_path: Path) -> None:
+    write_index(index, tmp_path / "index")
+    opened = open_index(tmp_path / "index")
+    assert opened.row_of_image == index.row_of_image
+    for name in ARRAYS:
+        mine, theirs = getattr(opened, name), getattr(index, name)
+        assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape)
+        np.testing.assert_array_equal(mine, theirs)
+        assert not mine.flags.writeable
+        assert len(mine) == 0 or isinstance(mine.base, np.memmap)
+    assert (opened.covariances is None) == (index.covariances is None)
+    if index.covariances is not None:
+        np.testing.assert_array_equal(opened.covariances, index.covariances)
+
+
+def test_files_of_a_shared_index_are_removed() -> None:
+    index = make_index()
+    with shared_index({"sift": index, "other": empty_index()}) as folders:
+        assert list(folders) == ["sift", "other"]
+        opened = open_index(folders["sift"])
+    assert not any(folder.parent.exists() for folder in folders.values())
+    # an open index stays valid
+    found = opened.shared_points(NAMES).tolist()
+    assert found == index.shared_points(NAMES).tolist()
+
+
+def test_a_map_without_points_has_an_empty_index(world: Any, tmp_path: Path) -> None:
+    whole = world.map()
+    root = Path(shutil.copytree(whole.root, tmp_path / "map", symlinks=True))
+    write_points3d(root, np.zeros((0, 6)))
+    write_observations(root, {})
+    empty = KaptureFolder(root, features_dirs=whole.features_dirs)
+    index = index_map(empty, "rootsift")
+    assert index.xyz.shape == (0, 3) and not index.row_of_image
+    with pytest.raises(DataError, match="no observations of type 'other'"):
+        index_map(world.map(), "other")
+
+
+def test_covariances_of_the_map_are_read(world: Any, tmp_path: Path) -> None:
+    folder = KaptureFolder(shutil.copytree(world.map().root, tmp_path / "map"))
+    count = len(folder.points3d())
+    known = np.arange(6.0 * count).reshape(count, 6)
+    write_point_covariances(folder.root, known)
+    index = index_map(folder, "rootsift")
+    np.testing.assert_array_equal(index.covariances, known)
+
+
+def test_noise_is_measured_by_points_with_several_observations(world: Any) -> None:
+    folder = world.map()
+    measured = with_noise(folder, index_map(folder, "rootsift"))
+    assert 0.02 < measured.noise_px < 1
+    assert measured.noise_rad == pytest.approx(measured.noise_px / 300, rel=0.5)
+    # lifted points have one observation, without error
+    once = np.unique(measured.point_ids, return_index=True)[1]
+    images = np.repeat(np.arange(len(measured.row_of_image)), np.diff(measured.offsets))[once]
+    lifted = MapIndex.build(
+        measured.xyz, tuple(measured.row_of_image), images, measured.keypoint_ids[once],
+        measured.point_ids[once],
+    )  # fmt: skip
+    lifted = replace(lifted, local_type="rootsift")
+    assert lifted.seen_once.all()
+    assert np.isnan(with_noise(folder, lifted).noise_px)

@@ -1,4 +1,4 @@
-"""What follows from what a stage declares: its settings, and the options that it may read."""
+"""Declarations of stages: their settings, and the paths that they read and write."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Declares(PipelineStage):
         return {}
 
 
-def test_settings_are_the_declared_options_and_no_more() -> None:
+def test_settings_are_the_declared_options() -> None:
     options = PipelineOptions(
         local_features=({"name": "rootsift", "options": {"max_keypoints": 5}}, {"name": "sift"})
     )
@@ -29,7 +29,7 @@ def test_settings_are_the_declared_options_and_no_more() -> None:
     }
 
 
-def test_the_matcher_does_not_concern_extraction_and_localization() -> None:
+def test_a_new_matcher_changes_settings_of_matching_stages_only() -> None:
     changed = PipelineOptions(matching={"name": "nn", "options": {"max_ratio": 0.5}})
     same = [kind.name for kind in PIPELINE if isinstance(kind.name, str)]
     for kind in PIPELINE:
@@ -40,7 +40,7 @@ def test_the_matcher_does_not_concern_extraction_and_localization() -> None:
     assert not {"mapping_matches", "query_matches"} & set(same)
 
 
-def test_no_stage_reads_a_path_that_only_a_later_stage_writes() -> None:
+def test_no_stage_reads_the_output_of_a_later_stage() -> None:
     for options in (PipelineOptions(), PipelineOptions(reranking={"by": "verified"})):
         written: list[str] = []
         stages = wanted_stages(PIPELINE, options)

@@ -1,4 +1,4 @@
-"""Work on executors: in order, bounded, and errors come through."""
+"""Ordered and bounded work on executors."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import pytest
-
-from megloc_kapture.errors import DataError
 from megloc_kapture.stages.work import FolderSpec, ordered_map
 
 
-def test_results_come_in_order_whatever_finishes_first() -> None:
+def test_results_are_in_order() -> None:
     first_may_end = threading.Event()
 
     def work(value: int) -> int:
@@ -26,7 +23,7 @@ def test_results_come_in_order_whatever_finishes_first() -> None:
     with ThreadPoolExecutor(3) as executor:
         assert list(ordered_map(work, range(20), executor, window=8)) == list(range(20))
         assert list(ordered_map(work, [], executor)) == []
-    # here they are made when they are asked for
+    # without an executor results are computed lazily
     done: list[int] = []
     results = ordered_map(lambda value: done.append(value) or value, [3, 1, 2])
     assert done == []
@@ -35,7 +32,7 @@ def test_results_come_in_order_whatever_finishes_first() -> None:
     assert list(results) == [1, 2]
 
 
-def test_at_most_a_window_of_items_is_taken_ahead() -> None:
+def test_at_most_a_window_of_items_is_submitted() -> None:
     taken = 0
 
     def items() -> Iterator[int]:
@@ -50,25 +47,9 @@ def test_at_most_a_window_of_items_is_taken_ahead() -> None:
             assert taken <= count + 5
 
 
-def test_an_error_of_a_worker_comes_through_with_its_place() -> None:
-    def fail_at_three(value: int) -> int:
-        if value == 3:
-            raise DataError("the third is broken", path="some/file", line=7)
-        return value * value
-
-    with ThreadPoolExecutor(2) as executor:
-        seen = []
-        with pytest.raises(DataError, match="some/file:7: the third is broken"):
-            for value in ordered_map(fail_at_three, range(50), executor, window=4):
-                seen.append(value)
-    assert seen == [0, 1, 4]
-
-
-def test_a_folder_is_opened_once_per_run(world: Any) -> None:
+def test_a_folder_is_opened_once_in_a_run(world: Any) -> None:
     spec = FolderSpec(world.mapping())
     assert spec.open() is spec.open()
-    # another run sees what was written since
+    # another run opens it again and reads new features
     other = FolderSpec(world.mapping())
     assert other.open() is not spec.open()
-    assert other.open().root == world.mapping().root
-    assert other.open().features_dirs == (world.features_dir,)
