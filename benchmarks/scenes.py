@@ -54,9 +54,9 @@ def measure(scene: Path, seed: int, workspace: Path, arguments: Sequence[str]) -
     seeds = [part for key in SEEDED for part in ("--set", f"{key}={seed}")]
     if (scene / "map").is_dir():
         found, report = workspace / f"localized-{seed}", workspace / f"evaluation-{seed}"
-        places = ("-i", str(scene / "map"), "--query", str(scene / "query"), "-o", str(found))
+        localized = ("-i", str(scene / "map"), "--query", str(scene / "query"), "-o", str(found))
         benchmark = ("--set", "localization.sure_confidence=none")
-        megloc("localize", *places, "-f", *benchmark, *seeds, *arguments)
+        megloc("localize", *localized, "-f", *benchmark, *seeds, *arguments)
         truth = ("--gt", str(scene / "query_gt"))
         megloc("evaluate", "-i", str(found), *truth, "-o", str(report), "-f")
     else:
