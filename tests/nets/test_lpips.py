@@ -146,11 +146,16 @@ def test_only_valid_pixels_count() -> None:
     assert distance(net, a, a) == 0.0 < distance(net, a, b)
     assert distance(net, a, b) == pytest.approx(distance(net, b, a), rel=1e-5)
     valid = torch.ones(1, 1, *SIZE)
-    valid[..., :24, :] = 0
+    valid[..., :20, :] = 0
     changed = b.clone()
-    changed[..., :24, :] = torch.rand(3, 24, SIZE[1])
+    changed[..., :20, :] = torch.rand(3, 20, SIZE[1])
     assert distance(net, a, changed, valid) == distance(net, a, b, valid)
     assert distance(net, a, changed) != distance(net, a, b)
+    # the mean is over valid pixels
+    zeros = [torch.zeros(1, channels, 8, 8) for channels in TAPS["alex"].values()]
+    ones = [x + 1 for x in zeros]
+    means = [net.between(zeros, ones, mask) for mask in (valid, torch.ones_like(valid))]
+    torch.testing.assert_close(*means)
 
 
 def test_checkpoints_load_strictly() -> None:

@@ -154,8 +154,13 @@ def draw_road(image: Image, seed: int) -> None:
     image[top:] = 90 + rng.normal(0, 2, image[top:].shape)
 
 
-@pytest.mark.parametrize("draw", [draw_spot, draw_road])
-def test_spots_and_roads_are_no_static_region(draw: Callable[[Image, int], None]) -> None:
+def draw_strip(image: Image, seed: int) -> None:
+    """Draw a static region narrower than any bonnet."""
+    image[70:, 96:106] = noise(99)[70:, 96:106]
+
+
+@pytest.mark.parametrize("draw", [draw_spot, draw_road, draw_strip])
+def test_spots_roads_and_strips_are_no_static_region(draw: Callable[[Image, int], None]) -> None:
     images = [noise(seed) for seed in range(16)]
     for seed, image in enumerate(images):
         draw(image, seed)
