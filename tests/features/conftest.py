@@ -1,4 +1,4 @@
-"""Images, and weights of local features: random ones, and published ones where available."""
+"""A photograph, and random weights of local features."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def other_superpoint() -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="session")
 def aslfeat_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random ones that answer to texture, converted from TensorFlow's names and layouts."""
+    """Random weights that respond to texture, converted from TensorFlow's layout."""
     arrays = {}
     for name, values in random_tensors("aslfeat").items():
         values = torch.randn(values.shape, generator=torch.Generator().manual_seed(len(arrays)))

@@ -1,8 +1,7 @@
-"""ASLFeat keypoints: hand-made score maps, random weights, and TensorFlow's keypoints."""
+"""ASLFeat against TensorFlow, and keypoints of hand-made score maps."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from megloc_kapture.features.aslfeat import (
 )
 from megloc_kapture.values import LocalFeatures
 
-# what make_reference.py of it has written
+# written by make_reference.py in the same folder
 TENSORFLOW = Path(__file__).parent.parent / "nets" / "data" / "aslfeat"
 OnMaps = Callable[..., LocalFeatures]
 
@@ -36,7 +35,7 @@ def extractor(weights: Path, **options: object) -> AslFeat:
 
 @pytest.fixture
 def on_maps(monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path) -> OnMaps:
-    """Extracts where the network answers with given maps."""
+    """Return a function that extracts keypoints of given maps."""
 
     def extracted(scores: torch.Tensor, features: torch.Tensor | None = None) -> LocalFeatures:
         height, width = scores.shape
@@ -45,7 +44,7 @@ def on_maps(monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path) -> OnMaps:
         given = (lambda _: [AslFeatMaps(scores, features)]), torch.device("cpu")
         monkeypatch.setattr(aslfeat.AslFeat, "network", lambda *_: given)
         image = np.zeros((height, width, 3), np.uint8)
-        image[0] = 255  # an image without any contrast is not looked at
+        image[0] = 255  # images without contrast are skipped
         return extractor(aslfeat_weights).extract(image)
 
     return extracted
@@ -60,26 +59,23 @@ def blobs(centres: list[tuple[float, float]], heights: list[float]) -> torch.Ten
     return scores
 
 
-def test_the_centre_of_a_blob(on_maps: OnMaps) -> None:
-    # a blob on a pixel's centre lies a half further in COLMAP's coordinates
+def test_keypoints_are_the_centres_of_blobs(on_maps: OnMaps) -> None:
     centres = [(20.0, 30.0), (50.3, 20.0), (60.25, 45.6)]
     result = on_maps(blobs(centres, [2.0, 1.5, 1.0]))
-    assert len(result.scores) == 3
-    expected = np.array(centres) + 0.5
-    assert np.abs(result.keypoints_px[:, :2] - expected).max() < 0.05
+    # a blob at a pixel's centre lies at half a pixel in COLMAP's coordinates
+    np.testing.assert_allclose(result.keypoints_px[:, :2], np.array(centres) + 0.5, atol=0.05)
     np.testing.assert_allclose(result.keypoints_px[0, :2], [20.5, 30.5], atol=1e-4)
     np.testing.assert_allclose(result.scores[0], 2.0, atol=1e-3)
 
 
-def test_weak_peaks_and_peaks_at_the_border_are_left_out(on_maps: OnMaps) -> None:
+def test_weak_peaks_and_peaks_at_the_border_are_no_keypoints(on_maps: OnMaps) -> None:
     centres = [(4.0, 30.0), (5.0, 45.0), (75.0, 20.0), (74.0, 40.0), (40.0, 30.0)]
-    scores = blobs(centres, [2.0, 1.5, 2.0, 1.2, 0.4])
-    result = on_maps(scores)
+    result = on_maps(blobs(centres, [2.0, 1.5, 2.0, 1.2, 0.4]))
     np.testing.assert_allclose(result.keypoints_px[:, :2], [[5.5, 45.5], [74.5, 40.5]], atol=0.01)
 
 
 @pytest.mark.parametrize("image", ["even", "odd"])
-def test_keypoints_are_tensorflows(image: str, tmp_path: Path) -> None:
+def test_keypoints_equal_tensorflow(image: str, tmp_path: Path) -> None:
     outputs = np.load(TENSORFLOW / "reference.npz")
     gray = outputs[f"{image}/image"]
     save_file(converted(), tmp_path / "aslfeat.safetensors")
@@ -95,10 +91,10 @@ def test_keypoints_are_tensorflows(image: str, tmp_path: Path) -> None:
     )
 
 
-def test_keypoints_of_small_scales_lie_where_they_are_in_the_image(
+def test_keypoints_of_all_scales_have_coordinates_of_the_image(
     monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path
 ) -> None:
-    # the network marks the brightest pixel of its input: the spot is detected on every scale
+    # the score is the brightness, so the spot is detected on every scale
     def net(gray: torch.Tensor) -> list[AslFeatMaps]:
         features = torch.ones(128, -(-gray.shape[2] // 4), -(-gray.shape[3] // 4))
         return [AslFeatMaps(gray[0, 0] / 255, features)]
@@ -121,7 +117,7 @@ def converted() -> dict[str, torch.Tensor]:
     return aslfeat_state(tensorflows_variables())
 
 
-def test_optimiser_state_is_left_out() -> None:
+def test_conversion_ignores_the_state_of_the_optimiser() -> None:
     variables = tensorflows_variables()
     slots = {
         "conv0/kernel/Momentum": variables["conv0/kernel"],
@@ -130,37 +126,30 @@ def test_optimiser_state_is_left_out() -> None:
     assert aslfeat_state(variables | slots).keys() == converted().keys()
 
 
-def test_mismatched_weights_are_named() -> None:
+def test_unsuitable_weights_are_named() -> None:
     state = converted()
-    for scale in (0.0, -1.0, math.inf):
-        with pytest.raises(DataError, match="tower/conv1/instance_max"):
-            aslfeat_from(state | {"tower.conv1.instance_max": torch.tensor(scale)}, "x")
+    with pytest.raises(DataError, match="tower/conv1/instance_max"):
+        aslfeat_from(state | {"tower.conv1.instance_max": torch.tensor(0.0)}, "x")
     state["conv7.weight"] = state.pop("conv6_0.weight")
-    state["conv3.weight"] = torch.zeros(32, 64, 3, 3)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=r"model\.ckpt: .*conv6_0\.weight.*conv7\.weight"):
         aslfeat_from(state, "model.ckpt")
-    for part in ("model.ckpt", "conv6_0.weight", "conv7.weight", "conv3.weight is (32, 64, 3, 3)"):
-        assert part in str(caught.value)
 
 
 @pytest.mark.parametrize("image", ["even", "odd"])
-@pytest.mark.parametrize(
-    ("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 1e-5)], ids=["64", "32"]
-)
-def test_maps_are_tensorflows(image: str, dtype: torch.dtype, tolerance: float) -> None:
+def test_maps_equal_tensorflow(image: str) -> None:
     outputs = np.load(TENSORFLOW / "reference.npz")
-    net = aslfeat_from(converted(), "aslfeat").to(dtype)
-    gray = torch.from_numpy(outputs[f"{image}/image"]).to(dtype)
+    net = aslfeat_from(converted(), "aslfeat").double()
+    gray = torch.from_numpy(outputs[f"{image}/image"]).double()
     with torch.inference_mode():
         maps = net(gray[None, None])[0]
-    scores = torch.from_numpy(outputs[f"{image}/score_map"]).to(dtype)
-    features = torch.from_numpy(outputs[f"{image}/features"]).to(dtype).permute(2, 0, 1)
-    assert scores.std() > 0.1 and features.std() > 0.5  # the comparison says something
-    torch.testing.assert_close(maps.scores, scores, rtol=0, atol=tolerance)
-    torch.testing.assert_close(maps.features, features, rtol=0, atol=10 * tolerance)
+    scores = torch.from_numpy(outputs[f"{image}/score_map"]).double()
+    features = torch.from_numpy(outputs[f"{image}/features"]).double().permute(2, 0, 1)
+    assert scores.std() > 0.1 and features.std() > 0.5
+    torch.testing.assert_close(maps.scores, scores, rtol=0, atol=1e-6)
+    torch.testing.assert_close(maps.features, features, rtol=0, atol=1e-5)
 
 
-def test_strips_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strips_give_the_same_peakiness(monkeypatch: pytest.MonkeyPatch) -> None:
     features = torch.randn(6, 20, 11, generator=torch.Generator().manual_seed(1))
     whole = peakiness(features, 3, torch.tensor(1.0))
     monkeypatch.setitem(aslfeat._VALUES_AT_ONCE, "cpu", 3 * 11 * 6)
@@ -172,16 +161,14 @@ CENTRE = torch.tensor([[20, 20]])
 
 
 @pytest.mark.parametrize(
-    ("length_px", "max_ratio", "stays"),
+    ("length_px", "max_ratio", "kept"),
     [(4.0, 10.0, True), (9.0, 10.0, True), (30.0, 10.0, False), (9.0, 2.0, False)],
 )
-def test_a_round_blob_is_no_edge_and_a_long_one_is(
-    length_px: float, max_ratio: float, stays: bool
-) -> None:
+def test_long_blobs_are_edges(length_px: float, max_ratio: float, kept: bool) -> None:
     blob = torch.exp(-((COLUMNS / 4) ** 2 + (ROWS / length_px) ** 2) / 2)
-    assert on_no_edge(blob, CENTRE, max_ratio).tolist() == [stays]
+    assert on_no_edge(blob, CENTRE, max_ratio).tolist() == [kept]
 
 
-def test_a_saddle_and_flat_ground_are_refused() -> None:
+def test_saddles_and_flat_regions_are_rejected() -> None:
     for scores in (COLUMNS**2 - ROWS**2, torch.ones(41, 41)):
         assert not on_no_edge(scores, CENTRE, 10.0).any()

@@ -1,4 +1,4 @@
-"""Large images are reduced before extraction: memory is bounded, keypoints stay where they were."""
+"""Reduction of large images before extraction, and masks of keypoints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.features.image_bound import (
     BoundedOptions,
-    bounded_image,
     bounded_size,
     extract_bounded,
     on_mask,
@@ -33,16 +32,14 @@ def discs(width: int, height: int) -> tuple[Image, NDArray[np.float64]]:
     return image, np.array(centres) + 0.5
 
 
-def test_sizes_up_to_the_bound_are_left_alone() -> None:
-    for size in ((1600, 1200), (2048, 2048), (3264, 2448), (1, 8_000_000)):
+def test_images_are_reduced_only_above_the_bound() -> None:
+    for size in ((2048, 2048), (3264, 2448)):
         assert bounded_size(*size, 8.0) == size
     assert bounded_size(12000, 9000, 8.0) == (3265, 2449)
     assert bounded_size(100_000_000, 1, 8.0) == (28284271, 1)
-    image = np.zeros((20, 30, 3), np.uint8)
-    assert bounded_image(image) is image
 
 
-def test_keypoints_of_a_reduced_image_are_where_they_were() -> None:
+def test_keypoints_of_a_reduced_image_keep_their_place() -> None:
     image, centres = discs(801, 603)
     whole = RootSift().extract(image)
     half, same = (RootSift(RootSiftOptions(max_megapixels=most)) for most in (0.1208, 0.5))
@@ -62,7 +59,7 @@ def test_keypoints_of_a_reduced_image_are_where_they_were() -> None:
     assert result.keypoints_px[:, 0].min() >= 401
 
 
-def test_a_plugin_without_the_option_is_bounded_all_the_same() -> None:
+def test_images_of_plugins_without_the_option_are_bounded_too() -> None:
     class Plain:
         def extract(self, image: Any, mask: Any = None) -> LocalFeatures:
             assert image.shape[0] * image.shape[1] <= 8e6
@@ -74,14 +71,15 @@ def test_a_plugin_without_the_option_is_bounded_all_the_same() -> None:
 
 
 def test_all_our_extractors_have_the_option() -> None:
-    ours = [one for one in entry_points(group=LOCAL_FEATURES) if "megloc_kapture." in one.value]
+    plugins = entry_points(group=LOCAL_FEATURES)
+    ours = [plugin for plugin in plugins if "megloc_kapture." in plugin.value]
     assert len(ours) > 5
     for extractor in ours:
         assert issubclass(extractor.load().Options, BoundedOptions), extractor.name
 
 
 def test_a_mask_is_read_at_the_pixel_of_a_keypoint() -> None:
-    # (2, 1) begins the pixel of column 2 and row 1; the image's far edge belongs to its last pixel
+    # (2, 1) is the corner of the pixel in column 2, row 1; the far edge belongs to the last pixel
     xy_px = np.array([[1.99, 0.99], [2.0, 1.0], [4.0, 3.0]], np.float32)
     for row, pixel in enumerate([(0, 1), (1, 2), (2, 3)]):
         mask = np.zeros((3, 4), bool)

@@ -1,4 +1,4 @@
-"""Rules of all extractors of local features: order, limits, masks, files."""
+"""Rules of all local feature extractors: order, limits, masks, files."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ KINDS: dict[str, Any] = {
     "xfeat": XFeat,
     "r2d2": R2D2,
 }
-# those with published weights see a part of a photograph, x, y, width and height
+# published weights, and the x, y, width and height of a part of a photograph
 PUBLISHED = {
-    "aliked": ("aliked/aliked-n16.pth", (400, 300, 320, 240)),
-    "xfeat": ("xfeat/xfeat.pt", (0, 0, 320, 256)),
+    "aliked": ("aliked/aliked-n16.pth", (400, 300, 192, 128)),
+    "xfeat": ("xfeat/xfeat.pt", (400, 300, 192, 128)),
     "r2d2": ("r2d2/r2d2_WASF_N16.pt", (600, 300, 160, 110)),
 }
 NETWORKS = [name for name in KINDS if "sift" not in name]
 DESCRIPTORS = {"superpoint": 256, "xfeat": 64}  # the others have 128
-# height and width; images without texture have no features
-FLAT = [(1, 1), (2, 5), (5, 5), (10, 40), (11, 11), (33, 31), (64, 48), (120, 160)]
+# height and width
+FLAT = [(1, 1), (2, 5), (11, 40), (33, 31)]
 SMALL = {
     "superpoint": [(7, 100), (8, 8)],
     "xfeat": [(20, 31), (33, 100)],
@@ -74,7 +74,7 @@ def weights(name: str, request: pytest.FixtureRequest) -> Path | None:
 
 @pytest.fixture
 def make(name: str, weights: Path | None) -> Make:
-    """Makes the extractor; it takes its options."""
+    """Return a function that builds the extractor with options."""
 
     def made(**options: Any) -> Any:
         if weights is not None:
@@ -89,7 +89,7 @@ def make(name: str, weights: Path | None) -> Make:
 @pytest.fixture
 def image(name: str, request: pytest.FixtureRequest) -> Image:
     if name not in PUBLISHED:
-        return texture(150, 203, sigma_px=1.5)
+        return texture(96, 131, sigma_px=1.5)
     x, y, width, height = PUBLISHED[name][1]
     whole = request.getfixturevalue("photograph")
     return np.ascontiguousarray(whole[y : y + height, x : x + width])
@@ -113,17 +113,17 @@ def assert_well_formed(result: LocalFeatures, name: str) -> None:
     np.testing.assert_allclose(length, 512.0 if name == "sift" else 1.0, **exact)
 
 
-def test_the_best_come_first_and_are_kept(name: str, make: Make, image: Image) -> None:
+def test_the_limit_keeps_the_best(name: str, make: Make, image: Image) -> None:
     every = make(max_keypoints=ALL).extract(image)
     assert_well_formed(every, name)
-    assert len(every.scores) > 60 and every.num_masked == 0
+    assert len(every.scores) > 30 and every.num_masked == 0
     assert (every.keypoints_px[:, :2] > 0).all()
     assert (every.keypoints_px[:, :2] < image.shape[1::-1]).all()
     assert (np.diff(every.scores) <= 0).all()
     if name in NETWORKS and name != "r2d2":
         np.testing.assert_array_equal(every.keypoints_px[:, 2], every.scores)
     if name != "sift":  # keeps whole levels
-        assert_same(make(max_keypoints=40).extract(image), every, slice(40))
+        assert_same(make(max_keypoints=20).extract(image), every, slice(20))
 
 
 def test_equal_scores_are_ordered_by_y_then_x() -> None:
@@ -143,37 +143,35 @@ def test_equal_scores_are_ordered_by_y_then_x() -> None:
     assert best(mask, 2) == ([0], 3)
 
 
-def test_the_mask_comes_before_the_limit(name: str, make: Make, image: Image) -> None:
+def test_the_mask_is_applied_before_the_limit(name: str, make: Make, image: Image) -> None:
     every = make(max_keypoints=ALL).extract(image)
     mask = np.ones(image.shape[:2], bool)
     assert_same(make(max_keypoints=ALL).extract(image, mask), every)
-    mask[:, 100:] = False
+    mask[:, 60:] = False
     x, y = np.floor(every.keypoints_px[:, :2]).astype(int).T
     allowed = mask[y, x]
-    assert 20 < allowed.sum() < len(allowed)
-    masked = make(max_keypoints=20).extract(image, mask)
-    assert_same(masked, every, np.flatnonzero(allowed)[:20])
+    assert 10 < allowed.sum() < len(allowed)
+    masked = make(max_keypoints=10).extract(image, mask)
+    assert_same(masked, every, np.flatnonzero(allowed)[:10])
     assert masked.num_masked == (~allowed).sum()
     nothing = make().extract(image, np.zeros_like(mask))
     assert_well_formed(nothing, name)
     assert len(nothing.scores) == 0 and nothing.num_masked == len(every.scores)
 
 
-def test_it_travels_and_names_its_weights(
+def test_a_pickled_plugin_is_small_and_gives_the_same_features(
     name: str, make: Make, image: Image, weights: Path | None
 ) -> None:
     first = make()
     expected = first.extract(image)
     packed = pickle.dumps(first)
     assert len(packed) < 10_000  # no network
-    result = pickle.loads(packed).extract(image.copy())
-    assert_same(result, expected)
-    assert result.descriptors.tobytes() == expected.descriptors.tobytes()
+    assert_same(pickle.loads(packed).extract(image.copy()), expected)
     if weights is not None:
         assert first.weights() == {weights.name: hashlib.sha256(weights.read_bytes()).hexdigest()}
 
 
-def test_small_and_flat_images(name: str, make: Make) -> None:
+def test_small_and_flat_images_give_valid_features(name: str, make: Make) -> None:
     for size in SMALL.get(name, FLAT):
         for image in (np.full((*size, 3), 90, np.uint8), texture(*size)):
             result = make().extract(image)
@@ -184,12 +182,11 @@ def test_small_and_flat_images(name: str, make: Make) -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_weights_that_are_missing_or_of_another_network(
+def test_missing_weights_and_weights_of_another_network_are_refused(
     name: str, make: Make, tmp_path: Path
 ) -> None:
     with pytest.raises(MissingWeightsError, match=name):
         KINDS[name]()
-    other = tmp_path / "other.pth"
-    torch.save({"conv1a.weight": torch.zeros(64, 1, 3, 3)}, other)
+    torch.save({"conv1a.weight": torch.zeros(64, 1, 3, 3)}, tmp_path / "other.pth")
     with pytest.raises(DataError, match=rf"other\.pth: .*{REFUSALS[name]}"):
-        make(weights=str(other)).extract(texture(40, 60))
+        make(weights=str(tmp_path / "other.pth")).extract(texture(40, 60))

@@ -36,33 +36,28 @@ def grid_of_centres(seed: int) -> NDArray[np.float64]:
 
 
 def in_some_order(features: LocalFeatures) -> NDArray[np.float64]:
-    """Rows x, y, descriptor, sorted."""
+    """Sorted rows of x, y, descriptor."""
     rows = np.hstack([features.keypoints_px, features.descriptors]).astype(np.float64)
     return rows[np.lexsort(rows.T[::-1])]
 
 
-def assert_same(a: LocalFeatures, b: LocalFeatures) -> None:
-    for name in ("keypoints_px", "scores", "descriptors"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
-# 1.6 to 2.5 px are found in the doubled octave, 3 in the image's own, 6 in the halved one
-@pytest.mark.parametrize("sigma_px", [1.6, 2.0, 2.5, 3.0, 6.0])
+# 1.6 px: doubled octave, 3 px: original size, 6 px: halved octave
+@pytest.mark.parametrize("sigma_px", [1.6, 3.0, 6.0])
 @pytest.mark.parametrize(("kind", "most_px"), [(RootSift, 0.1), (ColmapSift, 0.15)])
-def test_keypoints_are_where_colmap_puts_them(kind: Any, most_px: float, sigma_px: float) -> None:
+def test_keypoints_are_at_the_centres_of_blobs(kind: Any, most_px: float, sigma_px: float) -> None:
     centres = grid_of_centres(seed=int(10 * sigma_px))
     result = kind().extract(blobs(centres, sigma_px)).keypoints_px
     distance = np.linalg.norm(result[:, None] - centres, axis=2)
     offset = result[distance.argmin(axis=0)] - centres
     assert np.abs(offset).max() < most_px
-    # a forgotten half pixel is ten times this, OpenCV's quarter pixel five times
+    # a missing half pixel would be ten times this, OpenCV's quarter pixel five times
     assert np.abs(offset.mean(axis=0)).max() < 0.05
 
 
 def test_descriptors_are_square_roots_of_l1_normalised_sift() -> None:
-    image = texture(220, 280)
+    image = texture(110, 140)
     features = RootSift().extract(image)
-    assert len(features.scores) > 100
+    assert len(features.scores) > 40
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     sift = cv2.SIFT.create(5000, 3, 0.01, 10, 1.6, True)
     keypoints, raw = sift.detectAndCompute(gray, None)
@@ -74,9 +69,9 @@ def test_descriptors_are_square_roots_of_l1_normalised_sift() -> None:
     np.testing.assert_array_equal(root_sift(np.zeros((2, 128), np.float32)), 0.0)
 
 
-def test_a_database_that_colmap_writes_has_the_same(tmp_path: Path) -> None:
-    write_image(tmp_path / "images" / "a.png", texture(220, 280))
-    write_image(tmp_path / "images" / "b.jpg", texture(220, 280, seed=1))
+def test_features_equal_those_of_a_database_by_colmap(tmp_path: Path) -> None:
+    write_image(tmp_path / "images" / "a.png", texture(110, 140))
+    write_image(tmp_path / "images" / "b.jpg", texture(110, 140, seed=1))
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 1
     options.sift.max_num_features = 300
@@ -91,7 +86,7 @@ def test_a_database_that_colmap_writes_has_the_same(tmp_path: Path) -> None:
         assert sorted(database.images) == ["a.png", "b.jpg"]
         for name in database.images:
             keypoints, descriptors = database.keypoints(name), database.descriptors(name)
-            assert descriptors is not None and len(descriptors) > 200
+            assert descriptors is not None and len(descriptors) > 50
             official = LocalFeatures(keypoints, np.zeros(len(keypoints), np.float32), descriptors)
             ours = extractor.extract(read_image_rgb(tmp_path / "images" / name))
             np.testing.assert_array_equal(in_some_order(ours), in_some_order(official))
@@ -101,7 +96,7 @@ def test_the_options_of_sift_reach_colmap() -> None:
     plugin = load_plugin(LOCAL_FEATURES, "sift", {"max_keypoints": 10, "first_octave": 0})
     assert isinstance(plugin, ColmapSift)
     assert plugin.options == ColmapSiftOptions(max_keypoints=10, first_octave=0)
-    image = texture(220, 280)
+    image = texture(110, 140)
     everything = ColmapSift().extract(image)
 
     def extracted(**options: Any) -> NDArray[np.float32]:
@@ -110,22 +105,22 @@ def test_the_options_of_sift_reach_colmap() -> None:
     assert extracted(first_octave=0).min() > 1.5 > everything.scores.min()
     assert 0 < len(extracted(peak_threshold=0.03)) < len(everything.scores)
     # the coarsest are kept, whole levels: somewhat more than asked for
-    some = extracted(max_keypoints=50)
-    assert 50 <= len(some) < 0.5 * len(everything.scores)
+    some = extracted(max_keypoints=20)
+    assert 20 <= len(some) < 0.5 * len(everything.scores)
     assert some.mean() > everything.scores.mean()
 
 
-def test_threads_do_not_disturb_each_other() -> None:
-    images = [texture(110, 140, seed) for seed in range(4)]
+def test_threads_give_the_features_of_a_single_thread() -> None:
+    images = [texture(60, 80, seed) for seed in range(4)]
     extractor = ColmapSift()
-    one_by_one = [extractor.extract(image) for image in images]
+    expected = [extractor.extract(image) for image in images]
     with ThreadPoolExecutor(4) as threads:
-        for alone, together in zip(one_by_one, threads.map(extractor.extract, images), strict=True):
-            assert_same(alone, together)
+        for alone, other in zip(expected, threads.map(extractor.extract, images), strict=True):
+            np.testing.assert_array_equal(in_some_order(alone), in_some_order(other))
 
 
 def test_colour_is_rgb_not_bgr() -> None:
-    # red and blue of one luma in RGB's weights: no contrast to find in grey
+    # a red blob and its blue surroundings have the same luma
     image = np.zeros((120, 120, 3), dtype=np.uint8)
     y, x = np.mgrid[:120, :120] + 0.5
     blob = np.exp(-((x - 60) ** 2 + (y - 60) ** 2) / (2 * 3.0**2))

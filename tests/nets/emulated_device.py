@@ -24,7 +24,7 @@ _tensor = torch.tensor
 
 
 class DeviceTensor(torch.Tensor):
-    """A tensor that says it is on a GPU; ``numbers`` are its values, on the CPU."""
+    """A tensor that reports a GPU; ``numbers`` are its values on the CPU."""
 
     numbers: torch.Tensor
 
@@ -59,7 +59,7 @@ class DeviceTensor(torch.Tensor):
         return _run(func, args, kwargs or {})
 
 
-# torch's own, and its indexing, ask for the guard of a device, which builds for CPUs lack
+# torch's functions need a device guard, which CPU builds lack
 _GUARDED: dict[Any, Any] = {
     torch.nonzero: lambda x, as_tuple=False: _nonzero(x, as_tuple),
     torch.Tensor.nonzero: lambda x, as_tuple=False: _nonzero(x, as_tuple),
@@ -109,7 +109,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def _check(name: str, *values: Any) -> None:
-    """Allow tensors of one device only, but for single numbers on the CPU."""
+    """Refuse tensors of several devices; scalars on the CPU are allowed."""
     leaves = tree_leaves(values)
     actual = {leaf.device for leaf in leaves if isinstance(leaf, DeviceTensor)}
     arrays = (leaf for leaf in leaves if isinstance(leaf, torch.Tensor | np.ndarray))
@@ -123,7 +123,7 @@ def _computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if "pin_memory" in kwargs:
         kwargs = kwargs | {"pin_memory": False}
     if func._schema.name in ("aten::_softmax", "aten::_log_softmax") and args[2]:
-        return func(args[0].float(), args[1], False)  # from half to float, only GPUs do in one
+        return func(args[0].float(), args[1], False)  # CPUs cannot convert here
     halves = any(_float(leaf) is not leaf for leaf in tree_leaves((args, kwargs)))
     if halves and func._schema.name in PRODUCTS:  # with sums in float32, as GPUs do
         return func(*tree_map(_float, args), **tree_map(_float, kwargs)).half()

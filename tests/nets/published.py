@@ -19,12 +19,12 @@ FOLDER = Path(__file__).parent
 
 
 def published_shapes(name: str) -> Shapes:
-    """Key -> shape, as the files in ``keys`` have them."""
+    """Return keys and shapes from a file in ``keys``."""
     return _read(FOLDER / "keys" / f"{name}.txt")
 
 
 def delg_shapes(kind: str) -> Shapes:
-    """Name -> shape of the variables, as TensorFlow wrote them."""
+    """Return names and shapes of the variables in TensorFlow's checkpoint."""
     return _read(FOLDER / "data" / "delg" / f"{kind}.txt")
 
 
@@ -34,7 +34,7 @@ def _read(path: Path) -> Shapes:
 
 
 def delg_variables(kind: str) -> dict[str, NDArray[np.float32]]:
-    """As data/delg/make_reference.py has them."""
+    """Return the random variables of data/delg/make_reference.py."""
     drawn = {}
     words = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_variance")
     for name, shape in delg_shapes(kind).items():
@@ -55,7 +55,7 @@ def shapes_of(module: nn.Module) -> Shapes:
 
 
 def random_tensors(name: str, seed: int = 0) -> Tensors:
-    """Under the published keys; activations neither vanish nor grow with the depth."""
+    """Return random weights under the published keys, with activations near 1 at any depth."""
     generator = torch.Generator().manual_seed(seed)
     tensors = {}
     for key, shape in published_shapes(name).items():
@@ -71,7 +71,7 @@ def random_tensors(name: str, seed: int = 0) -> Tensors:
 
 
 def randomised(module: Net, seed: int = 0) -> Net:
-    """Weights whose activations stay near 1, statistics of no layer trivial."""
+    """Draw weights with activations near 1 and non-trivial batch statistics."""
     torch.manual_seed(seed)
     for part in module.modules():
         if isinstance(part, nn.Conv2d):

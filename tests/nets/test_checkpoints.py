@@ -1,4 +1,4 @@
-"""Checkpoints of all networks: the published keys, shapes and files, and files that do not fit."""
+"""Keys, shapes and sizes of all networks against their published checkpoints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def openibl_net() -> VggNetVlad:
     return VggNetVlad(order="kd", mean_rgb=(0.0, 0.0, 0.0))
 
 
-# the network, and its published number of parameters
+# network and published number of parameters
 NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "apgem-resnet101": (ApGemNet, 46_696_513),
     "deeplabv3plus-resnet101": (lambda: DeepLabV3Plus("resnet101", num_classes=19), 58_753_459),
@@ -42,7 +42,7 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "superglue": (SuperGlueNet, 12_023_297),
     "superpoint": (SuperPointNet, 1_300_865),
 }
-# the same of all that a file holds
+# network and number of values in the published file
 STORED: dict[str, tuple[Callable[[], nn.Module], int | None]] = {
     "r2d2_WASF_N16": (R2D2Network, 485_803),
     "r2d2_WASF_N8_big": (lambda: R2D2Network(48), 1_041_019),
@@ -51,14 +51,13 @@ STORED: dict[str, tuple[Callable[[], nn.Module], int | None]] = {
 ALIKED = {
     "aliked-t16": (192_588, 64),
     "aliked-n16": (678_324, 128),
-    "aliked-n16rot": (678_324, 128),
     "aliked-n32": (980_468, 128),
 }
 R2D2_WIDTHS = {"r2d2_WAF_N16": 32, "r2d2_WASF_N16": 32, "r2d2_WASF_N8_big": 48}
 
 
 @pytest.mark.parametrize("name", [*NETWORKS, *STORED])
-def test_keys_and_shapes_are_the_published_ones(name: str) -> None:
+def test_keys_and_shapes_equal_the_published_checkpoints(name: str) -> None:
     make, number = (NETWORKS | STORED)[name]
     with torch.device("meta"):
         network = make()
@@ -69,7 +68,7 @@ def test_keys_and_shapes_are_the_published_ones(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*ALIKED, *R2D2_WIDTHS])
-def test_the_published_files_load_strictly(shared_data: Path, name: str) -> None:
+def test_published_files_load_strictly(shared_data: Path, name: str) -> None:
     is_aliked = name in ALIKED
     place = f"aliked/{name}.pth" if is_aliked else f"r2d2/{name}.pt"
     tensors = read_weights(find_weights(str(shared_data / "weights" / place)))

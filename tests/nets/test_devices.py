@@ -1,4 +1,4 @@
-"""Every network on an emulated GPU: one device, no index on the CPU, half precision."""
+"""Networks on an emulated GPU: device of all tensors, half precision."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 import torch
 from emulated_device import emulated_devices
 from numpy.typing import NDArray
+from published import randomised
 
 from megloc_kapture.features import global_networks
 from megloc_kapture.features.aliked import Aliked
@@ -23,30 +24,38 @@ from megloc_kapture.io.weights import UNVERIFIED
 from megloc_kapture.localization import lpips
 from megloc_kapture.matching.networks import LightGlue, SuperGlue
 from megloc_kapture.nets import runtime
-from megloc_kapture.preprocessing.deeplab import DeepLab
+from megloc_kapture.preprocessing.deeplab import DeepLab, DeepLabV3Plus
 from megloc_kapture.values import ImageFeatures
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from whole_preset_weights import Sizes, write_random_weights  # noqa: E402
 
 DEVICE = "cuda:1"
-HEIGHT, WIDTH = 96, 128
+HEIGHT, WIDTH = 64, 96
 SLOW = pytest.mark.slow
 EXTRACTORS: dict[str, tuple[Any, dict[str, Any]]] = {
     "superpoint_v1": (SuperPoint, {}),
     "aslfeat": (AslFeat, {}),
     "aliked-n16": (Aliked, {"threshold": 0.0}),
-    "r2d2_WASF_N16": (R2D2, {"min_size": 80, "max_size": 100}),
+    "r2d2_WASF_N16": (R2D2, {"min_size": 60, "max_size": 72}),
     "xfeat": (XFeat, {}),
     "disk": (Disk, {}),
 }
 GLOBAL: dict[str, tuple[Any, dict[str, Any]]] = {
-    "openibl": (global_networks.OpenIbl, {"max_size_px": 128}),
+    "openibl": (global_networks.OpenIbl, {"max_size_px": 64}),
     "apgem-resnet101-lm18": (global_networks.ApGem, {}),
     "delg-r101-gldv2clean": (global_networks.Delg, {"scales": [1.0]}),
 }
 HEAVY = {"apgem-resnet101-lm18", "delg-r101-gldv2clean"}
 MATCHERS = {"superglue_outdoor": SuperGlue, "superpoint_lightglue": LightGlue}
+
+
+def keep_four_layers(path: Path) -> None:
+    state = torch.load(path, weights_only=True)
+    for key in list(state):
+        if key.startswith("gnn.layers.") and int(key.split(".")[2]) > 3:
+            del state[key]
+    torch.save(state, path)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +67,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., 
         for name in names:
             if name not in written:
                 sizes = Sizes(clusters=4, whitened=32, hidden=8)
-                write_random_weights(folder / UNVERIFIED, sizes=sizes, names=[name])
+                paths = write_random_weights(folder / UNVERIFIED, sizes=sizes, names=[name])
+                if name == "superglue_outdoor":
+                    keep_four_layers(paths[name])
                 written.add(name)
 
     written: set[str] = set()
@@ -104,11 +115,11 @@ def test_local_features(name: str, weights: Callable[..., None], image: NDArray[
     cpu, result = on_both(
         kind, options | {"max_keypoints": 200}, lambda p: p.extract_many(images, masks)
     )
-    for one, other in zip(cpu, result, strict=True):
-        assert len(one.scores) > 20
-        apart = np.linalg.norm(one.keypoints_px[:, None, :2] - other.keypoints_px[:, :2], axis=2)
+    for exact, half in zip(cpu, result, strict=True):
+        assert len(exact.scores) > 20
+        apart = np.linalg.norm(exact.keypoints_px[:, None, :2] - half.keypoints_px[:, :2], axis=2)
         near = apart.min(axis=1) < 1.0
-        cosine = (one.descriptors * other.descriptors[apart.argmin(axis=1)]).sum(axis=1)
+        cosine = (exact.descriptors * half.descriptors[apart.argmin(axis=1)]).sum(axis=1)
         assert near.mean() > 0.5
         assert np.median(cosine[near]) > 0.95
 
@@ -130,16 +141,16 @@ def test_matches(name: str, weights: Callable[..., None]) -> None:
     rng = np.random.default_rng(0)
 
     def features(number: int) -> ImageFeatures:
-        xy = rng.uniform(1, 90, (number, 2))
+        xy = rng.uniform(1, 60, (number, 2))
         descriptors = rng.normal(size=(number, 256))
         descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
         table = np.column_stack([xy, rng.uniform(0.1, 1, number)]).astype(np.float32)
         return ImageFeatures(table, descriptors.astype(np.float32), WIDTH, HEIGHT)
 
-    a, less, none = features(60), features(1), features(0)
-    order = rng.permutation(60)[:40]
+    a, less, none = features(40), features(1), features(0)
+    order = rng.permutation(40)[:30]
     b = ImageFeatures(a.keypoints_px[order], a.descriptors[order], WIDTH, HEIGHT)
-    options = {"sinkhorn_iterations": 5} if name == "superglue_outdoor" else {}
+    options = {"sinkhorn_iterations": 2} if name == "superglue_outdoor" else {}
     cpu, result = on_both(MATCHERS[name], options, lambda p: p.match_many(a, [b, less, none]))
     pairs = [set(map(tuple, matches.tolist())) for matches, _ in (cpu[0], result[0])]
     assert len(pairs[0]) > 20
@@ -147,18 +158,19 @@ def test_matches(name: str, weights: Callable[..., None]) -> None:
     assert len(result[2][0]) == 0
 
 
-@SLOW
-def test_labels(weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
+def test_labels(tmp_path: Path, image: NDArray[np.uint8]) -> None:
     """In full precision only: activations of random weights exceed float16."""
-    weights("deeplabv3plus-resnet101")
-    cpu, result = on_both(DeepLab, {}, lambda p: p.segment(image), half=False)
-    assert (cpu == result).mean() > 0.999
+    network = randomised(DeepLabV3Plus("mobilenet", num_classes=19))
+    torch.save({"model_state": network.state_dict()}, tmp_path / "mobilenet.pth")
+    options = {"weights": str(tmp_path / "mobilenet.pth")}
+    cpu, result = on_both(DeepLab, options, lambda p: p.segment(image), half=False)
+    assert (cpu == result).mean() > 0.999 and len(np.unique(cpu)) > 1
 
 
 def test_image_distance(weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
     weights("lpips-trunk-alex", "lpips-alex")
     valid = np.ones((HEIGHT, WIDTH), bool)
-    valid[:, :30] = False
+    valid[:, :20] = False
     cpu, result = on_both(
         lpips.LpipsDistance, {}, lambda p: p.distance(image, image[::-1].copy(), valid)
     )

@@ -1,8 +1,7 @@
-"""LPIPS: the published formula written out in loops, keys, and properties of a distance."""
+"""LPIPS against the published formula, and its checkpoints."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from published import randomised
@@ -13,7 +12,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.nets.lpips import Lpips, Trunk, lpips_from
 
 TRUNKS: tuple[Trunk, ...] = ("alex", "vgg", "squeeze")
-# torchvision's layers, as (kind, numbers): written here from the published tables once more
+# torchvision's layers, as (kind, numbers), from the published tables
 ALEX = [
     *(("conv", 0, 4, 2), ("relu",), ("pool", False), ("conv", 3, 1, 2), ("relu",), ("pool", False)),
     *(("conv", 6, 1, 1), ("relu",), ("conv", 8, 1, 1), ("relu",), ("conv", 10, 1, 1), ("relu",)),
@@ -28,8 +27,9 @@ TAPS = {
     "vgg": {3: 64, 8: 128, 15: 256, 22: 512, 29: 512},
     "squeeze": {1: 64, 4: 128, 7: 256, 9: 384, 10: 384, 11: 512, 12: 512},
 }
-# values of all heads and of the trunks, without their classifiers
-NUM_VALUES = {"alex": (1152, 2469696), "vgg": (1472, 14714688), "squeeze": (2240, 722496)}
+# of the trunks without their classifiers
+NUM_VALUES = {"alex": 2469696, "vgg": 14714688, "squeeze": 722496}
+SIZE = (40, 48)
 
 
 def random_lpips(trunk: Trunk, seed: int = 0) -> Lpips:
@@ -51,9 +51,10 @@ def net(trunk: Trunk) -> Lpips:
     return random_lpips(trunk)
 
 
-def pictures(seed: int, height: int = 47, width: int = 61) -> tuple[torch.Tensor, torch.Tensor]:
+def pictures(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
-    return tuple(torch.rand(1, 3, height, width, generator=generator) for _ in range(2))
+    a, b = torch.rand(2, 1, 3, *SIZE, generator=generator)
+    return a, b
 
 
 def functional_trunk(
@@ -93,29 +94,23 @@ def functional_trunk(
     return result
 
 
-def by_formula(
-    kind: Trunk, state: dict[str, torch.Tensor], a: torch.Tensor, b: torch.Tensor
-) -> float:
-    """Eq. 1: sum over layers, mean over places, of || w * (y - y0) ||^2, with w the roots."""
-    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-
-    def tapped(image: torch.Tensor) -> list[np.ndarray]:
-        rgb = 2 * image.numpy().astype(np.float64) - 1
-        x = (rgb - shift[:, None, None]) / scale[:, None, None]
-        with torch.inference_mode():
-            result = functional_trunk(kind, state, torch.from_numpy(x).float())
-        return [each[0].numpy().astype(np.float64) for each in result]
-
+def by_formula(kind: Trunk, state: dict[str, torch.Tensor], a: torch.Tensor, b: torch.Tensor):
+    """Eq. 1: sum over layers, mean over pixels, of || w * (y - y0) ||^2, with w^2 the heads."""
+    shift, scale = torch.tensor([[-0.030, -0.088, -0.188], [0.458, 0.448, 0.450]]).double()
     total = 0.0
-    for layer, (one, other) in enumerate(zip(tapped(a), tapped(b), strict=True)):
-        w = np.sqrt(state[f"lin{layer}.model.1.weight"].numpy().astype(np.float64).ravel())
-        places = 0.0
-        for row, column in np.ndindex(*one.shape[1:]):
-            y, y0 = one[:, row, column], other[:, row, column]
-            y = y / (np.sqrt((y**2).sum()) + 1e-10)
-            y0 = y0 / (np.sqrt((y0**2).sum()) + 1e-10)
-            places += ((w * (y - y0)) ** 2).sum()
-        total += places / one[0].size
+    with torch.inference_mode():
+        taps = [
+            functional_trunk(
+                kind,
+                state,
+                ((2 * x.double() - 1 - shift[:, None, None]) / scale[:, None, None]).float(),
+            )
+            for x in (a, b)
+        ]
+    for layer, (y, y0) in enumerate(zip(*taps, strict=True)):
+        weights = state[f"lin{layer}.model.1.weight"].double()
+        difference = F.normalize(y.double(), dim=1) - F.normalize(y0.double(), dim=1)
+        total += float((weights * difference**2).sum(1).mean())
     return total
 
 
@@ -126,50 +121,56 @@ def distance(net: Lpips, a: torch.Tensor, b: torch.Tensor, valid: torch.Tensor |
         return float(net(a, b, valid)[0])
 
 
-def test_it_is_the_published_formula(net: Lpips, trunk: Trunk) -> None:
+def test_the_distance_equals_the_published_formula(net: Lpips, trunk: Trunk) -> None:
     a, b = pictures(1)
     expected = by_formula(trunk, net.state_dict(), a, b)
     assert expected > 0.01
     assert distance(net, a, b) == pytest.approx(expected, rel=1e-4)
 
 
-def test_keys_and_shapes_are_the_published_ones(net: Lpips, trunk: Trunk) -> None:
+def test_keys_and_sizes_equal_the_published_files(net: Lpips, trunk: Trunk) -> None:
     state = net.state_dict()
     heads = {key: tuple(value.shape) for key, value in state.items() if key.startswith("lin")}
     assert heads == {
         f"lin{k}.model.1.weight": (1, channels, 1, 1)
         for k, channels in enumerate(TAPS[trunk].values())
     }
-    others = [value.numel() for key, value in state.items() if not key.startswith("lin")]
-    assert (sum(int(np.prod(s)) for s in heads.values()), sum(others)) == NUM_VALUES[trunk]
-    assert all(key.startswith(("lin", "features.")) for key in state)
+    features = [value.numel() for key, value in state.items() if key.startswith("features.")]
+    assert sum(features) == NUM_VALUES[trunk]
+    assert len(features) + len(heads) == len(state)
 
 
-def test_it_is_a_distance_of_the_valid_pixels() -> None:
+def test_only_valid_pixels_count() -> None:
     net = random_lpips("alex")
-    a, b = pictures(3, 48, 64)
+    a, b = pictures(3)
     assert distance(net, a, a) == 0.0 < distance(net, a, b)
     assert distance(net, a, b) == pytest.approx(distance(net, b, a), rel=1e-5)
-    valid = torch.ones(1, 1, 48, 64)
-    valid[..., :24, :] = 0
+    valid = torch.ones(1, 1, *SIZE)
+    valid[..., :20, :] = 0
     changed = b.clone()
-    changed[..., :24, :] = torch.rand(3, 24, 64)
+    changed[..., :20, :] = torch.rand(3, 20, SIZE[1])
     assert distance(net, a, changed, valid) == distance(net, a, b, valid)
     assert distance(net, a, changed) != distance(net, a, b)
-    same = torch.cat([b[..., :24, :], a[..., 24:, :]], dim=2)
-    assert distance(net, a, same, valid) == 0.0 < distance(net, a, same)
+    # the mean is over valid pixels
+    zeros = [torch.zeros(1, channels, 8, 8) for channels in TAPS["alex"].values()]
+    ones = [x + 1 for x in zeros]
+    means = [net.between(zeros, ones, mask) for mask in (valid, torch.ones_like(valid))]
+    torch.testing.assert_close(*means)
 
 
-def test_checkpoints_load_strictly(net: Lpips, trunk: Trunk) -> None:
+def test_checkpoints_load_strictly() -> None:
+    net = random_lpips("squeeze")
     state = dict(net.state_dict())
     heads = {key: state.pop(key) for key in list(state) if key.startswith("lin")}
-    # torchvision's files hold a classifier too
-    of_trunk = {**state, "classifier.1.weight": torch.zeros(3)}
-    loaded = lpips_from(trunk, of_trunk, heads, "file")
+    # torchvision's files also hold a classifier
+    trunk = {**state, "classifier.1.weight": torch.zeros(3)}
     a, b = pictures(5)
-    assert distance(loaded, a, b) == distance(net, a, b)
-    del of_trunk["features.0.bias"]
-    with pytest.raises(DataError, match=r"missing keys: features\.0\.bias"):
-        lpips_from(trunk, of_trunk, heads, "file")
-    with pytest.raises(DataError, match=r"lin0\.model\.1\.weight"):
-        lpips_from(trunk, state, {**heads, "lin0.model.1.weight": torch.zeros(1, 9, 1, 1)}, "file")
+    assert distance(lpips_from("squeeze", trunk, heads, "file"), a, b) == distance(net, a, b)
+    without = {key: value for key, value in trunk.items() if key != "features.0.bias"}
+    other_heads = {**heads, "lin0.model.1.weight": torch.zeros(1, 9, 1, 1)}
+    for tensors, linear, message in (
+        (without, heads, r"missing keys: features\.0\.bias"),
+        (trunk, other_heads, r"lin0\.model\.1\.weight"),
+    ):
+        with pytest.raises(DataError, match=message):
+            lpips_from("squeeze", tensors, linear, "file")

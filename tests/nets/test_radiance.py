@@ -39,9 +39,14 @@ def random_samples(shape: tuple[int, int], dtype: torch.dtype) -> Samples:
     return Samples(2 * drawn(), drawn(3), drawn(), drawn(3), drawn())
 
 
-def test_a_slab_of_constant_density_is_beer_and_lambert() -> None:
-    edges = torch.linspace(1.0, 3.0, 2001, dtype=torch.float64)
-    t, deltas = (0.5 * (edges[1:] + edges[:-1]))[None], torch.diff(edges)[None]
+def slab(near: float, far: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Dense samples between two depths, and their spacings."""
+    edges = torch.linspace(near, far, 4001, dtype=torch.float64)
+    return (0.5 * (edges[1:] + edges[:-1]))[None], torch.diff(edges)[None]
+
+
+def test_a_slab_of_constant_density_follows_beer_and_lambert() -> None:
+    t, deltas = slab(1.0, 3.0)
     sigma, colour = 0.8, torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     samples = Samples(torch.full_like(t, sigma), colour.expand(1, t.shape[1], 3))
     result = composite(t, deltas, samples)
@@ -55,12 +60,10 @@ def test_a_slab_of_constant_density_is_beer_and_lambert() -> None:
 
 
 def test_a_transient_slab_shares_the_light_by_density() -> None:
-    edges = torch.linspace(0.0, 1.0, 4001, dtype=torch.float64)
-    t, deltas = (0.5 * (edges[1:] + edges[:-1]))[None], torch.diff(edges)[None]
+    t, deltas = slab(0.0, 1.0)
     ones = torch.ones_like(t)
-    black, white = torch.zeros(1, t.shape[1], 3), torch.ones(1, t.shape[1], 3)
-    samples = Samples(0.5 * ones, black.double(), 1.5 * ones, white.double(), 0.4 * ones)
-    result = composite(t, deltas, samples)
+    white = torch.ones(*t.shape, 3, dtype=torch.float64)
+    result = composite(t, deltas, Samples(0.5 * ones, 0 * white, 1.5 * ones, white, 0.4 * ones))
     opacity = 1 - math.exp(-2.0)
     assert result.rgb[0, 0].item() == pytest.approx(0.75 * opacity, rel=1e-3)
     assert result.beta.item() == pytest.approx(0.03 + 0.4 * 0.75 * opacity, rel=1e-3)
@@ -73,14 +76,13 @@ def test_without_transient_density_it_is_nerf_a() -> None:
     t = torch.linspace(1, 2, 12, dtype=torch.float64).expand(5, -1)
     deltas = torch.full_like(t, 0.1)
     off = replace(samples, transient_sigma=torch.zeros_like(samples.transient_sigma))
-    with_none = composite(t, deltas, Samples(samples.sigma, samples.rgb))
+    plain = composite(t, deltas, Samples(samples.sigma, samples.rgb))
     with_zero = composite(t, deltas, off)
     for name in ("rgb", "depth", "opacity", "beta", "weights"):
-        torch.testing.assert_close(getattr(with_none, name), getattr(with_zero, name))
+        torch.testing.assert_close(getattr(plain, name), getattr(with_zero, name))
     seen = torch.rand(5, 3, dtype=torch.float64)
-    squared = torch.square(with_none.rgb - seen).mean()
-    expected = squared / (2 * 0.03**2) + math.log(0.03) + 3
-    torch.testing.assert_close(nerf_w_loss(with_none, seen), expected)
+    expected = torch.square(plain.rgb - seen).mean() / (2 * 0.03**2) + math.log(0.03) + 3
+    torch.testing.assert_close(nerf_w_loss(plain, seen), expected)
 
 
 def test_samples_lie_where_they_should() -> None:
@@ -105,11 +107,7 @@ def test_encoding_has_the_order_of_the_public_code() -> None:
     torch.testing.assert_close(result, torch.cat(expected, dim=1))
 
 
-def linear(entering: int, leaving: int) -> int:
-    return (entering + 1) * leaving
-
-
-def test_nerfw_has_the_names_and_sizes_of_the_public_branch() -> None:
+def test_nerfw_has_the_keys_and_sizes_of_the_public_code() -> None:
     field = NerfW(7)
     names = set(field.state_dict())
     blocks = [f"xyz_encoding_{number}.0" for number in range(1, 9)]
@@ -120,15 +118,14 @@ def test_nerfw_has_the_names_and_sizes_of_the_public_branch() -> None:
         "embedding_a.weight",
         "embedding_t.weight",
         *(f"nerf_coarse.{block}.{kind}" for block in blocks for kind in ("weight", "bias")),
-        *(f"nerf_fine.{one}.{kind}" for one in blocks + moving for kind in ("weight", "bias")),
+        *(f"nerf_fine.{block}.{kind}" for block in blocks + moving for kind in ("weight", "bias")),
     }
-    trunk = linear(63, 256) + 6 * linear(256, 256) + linear(256 + 63, 256) + linear(256, 256)
-    heads = linear(256, 1) + linear(128, 3)
-    coarse = trunk + heads + linear(256 + 27, 128)
-    fine = trunk + heads + linear(256 + 27 + 48, 128)
-    fine += linear(256 + 16, 128) + 3 * linear(128, 128) + 2 * linear(128, 1) + linear(128, 3)
-    assert sum(value.numel() for value in field.nerf_coarse.parameters()) == coarse
-    assert sum(value.numel() for value in field.nerf_fine.parameters()) == fine
+    # sums of (inputs + 1) * outputs over the layers of the public code
+    sizes = [
+        sum(value.numel() for value in net.parameters())
+        for net in (field.nerf_coarse, field.nerf_fine)
+    ]
+    assert sizes == [595_844, 687_113]
     assert field.embedding_a.weight.shape == (7, 48) and field.embedding_t.weight.shape == (7, 16)
     assert tuple(field.state_dict()["nerf_fine.xyz_encoding_5.0.weight"].shape) == (256, 319)
 
@@ -150,7 +147,6 @@ def test_a_field_renders_rays(kind: type[NerfW] | type[TriPlane]) -> None:
     assert all(value.grad is not None for value in field.parameters())
     plain = field.render(rays)
     assert (plain.beta == 0.03).all() and plain.transient_density == 0
-    # what is transient in one image is nowhere else, its light is
     torch.testing.assert_close(plain.rgb, field.render(rays).rgb)
     other = replace(rays, appearance=field.appearance(images) + 1.0)
     assert not torch.equal(field.render(other).rgb, plain.rgb)

@@ -1,7 +1,6 @@
-"""SuperGlue against transformers' on the same random weights, and its optimal transport.
+"""SuperGlue and its optimal transport against transformers on the same random weights.
 
-The weights are peaky: attention looks at few keypoints, and descriptors that correspond are found,
-so that a wrong head, a wrong mask or a lost message changes the matches.
+The weights are peaky, so that attention and matches depend on few keypoints.
 """
 
 from __future__ import annotations
@@ -50,16 +49,16 @@ def peaky_weights() -> dict[str, torch.Tensor]:
     return result
 
 
-def random_image(num: int, seed: int, size: int = SIZE) -> ImageKeypoints:
+def random_image(num: int, seed: int) -> ImageKeypoints:
     generator = torch.Generator().manual_seed(seed)
-    descriptors = functional.normalize(torch.randn((num, size), generator=generator), dim=1)
+    descriptors = functional.normalize(torch.randn((num, SIZE), generator=generator), dim=1)
     pixels = torch.rand((num, 2), generator=generator) * torch.tensor([WIDTH - 1.0, HEIGHT - 1.0])
     scores = 0.05 + 0.9 * torch.rand(num, generator=generator)
     return ImageKeypoints(normalise_keypoints(pixels, WIDTH, HEIGHT), scores, descriptors)
 
 
 def seen_again(image: ImageKeypoints, num: int, num_new: int, seed: int) -> ImageKeypoints:
-    """Another view of the first keypoints, moved and noisy, with others among them."""
+    """Another view of the first keypoints, moved and noisy, mixed with new keypoints."""
     generator = torch.Generator().manual_seed(seed)
     new = random_image(num_new, seed + 1000)
     noise = torch.randn((num, SIZE), generator=generator) / SIZE**0.5
@@ -73,13 +72,10 @@ def seen_again(image: ImageKeypoints, num: int, num_new: int, seed: int) -> Imag
     )
 
 
-def transformers_model(
-    weights: dict[str, torch.Tensor], *, by_head: bool = True
-) -> SuperGlueForKeypointMatching:
-    """With the weights under its own names, and its heads one after the other."""
+def transformers_model(weights: dict[str, torch.Tensor]) -> SuperGlueForKeypointMatching:
+    """Rename the weights, and sort channels by attention head."""
     # row h * (SIZE / 4) + d of its projections is row d * 4 + h of the official ones
-    order = torch.arange(SIZE)
-    order = order.view(SIZE // 4, 4).T.flatten() if by_head else order
+    order = torch.arange(SIZE).view(SIZE // 4, 4).T.flatten()
     renamed = {}
     for key, value in weights.items():
         name, value = key, value.squeeze(-1) if value.ndim == 3 else value
@@ -122,7 +118,7 @@ def transformers_model(
 def transformers_matches(
     model: SuperGlueForKeypointMatching, a: ImageKeypoints, b: ImageKeypoints
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Partner in b of each keypoint of a, -1 without; and scores."""
+    """Partner in b of each keypoint of a, or -1, and scores."""
     half = torch.tensor([WIDTH, HEIGHT]) / 2
     matches, scores, _, _ = model._match_image_pair(
         torch.stack([image.xy * 0.7 * WIDTH + half for image in (a, b)])[None],
@@ -135,7 +131,7 @@ def transformers_matches(
 
 
 def partners(assignment: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """As :func:`transformers_matches` has it."""
+    """Return partners and scores like :func:`transformers_matches`."""
     matches, scores = mutual_matches(assignment, THRESHOLD)
     partner = torch.full((len(assignment) - 1,), -1)
     values = torch.zeros(len(assignment) - 1)
@@ -143,30 +139,30 @@ def partners(assignment: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return partner, values
 
 
-def network() -> SuperGlueNet:
-    return superglue(peaky_weights(), "w.pth").eval()
+@pytest.fixture(scope="module")
+def weights() -> dict[str, torch.Tensor]:
+    return peaky_weights()
+
+
+@pytest.fixture(scope="module")
+def net(weights: dict[str, torch.Tensor]) -> SuperGlueNet:
+    return superglue(weights, "w.pth").eval()
 
 
 @torch.inference_mode()
-def test_matches_are_transformers() -> None:
+def test_matches_equal_transformers(net: SuperGlueNet, weights: dict[str, torch.Tensor]) -> None:
     a = random_image(150, 0)
     b = seen_again(a, 110, 40, 0)
-    weights = peaky_weights()
-    partner, scores = partners(network()([(a, b)], 100)[0])
+    partner, scores = partners(net([(a, b)], 100)[0])
     expected, expected_scores = transformers_matches(transformers_model(weights), a, b)
     result = partner >= 0
-    assert 40 < result.sum() < 150  # some match and some do not
+    assert 40 < result.sum() < 150
     assert partner.tolist() == expected.tolist()
     torch.testing.assert_close(scores, expected_scores * result, rtol=0, atol=1e-5)
-    # heads in the wrong order are another network
-    interleaved = transformers_model(weights, by_head=False)
-    _, other_scores = transformers_matches(interleaved, a, b)
-    assert (other_scores - scores).abs().max() > 0.05
 
 
 @torch.inference_mode()
-def test_pairs_of_any_sizes_together_are_each_alone() -> None:
-    net = network()
+def test_a_batch_of_pairs_of_any_sizes_gives_the_matches_of_each_pair(net: SuperGlueNet) -> None:
     a = random_image(150, 0)
     pairs = [
         (a, seen_again(a, 110, 40, 0)),
@@ -185,8 +181,7 @@ def test_pairs_of_any_sizes_together_are_each_alone() -> None:
 
 
 @torch.inference_mode()
-def test_half_precision_ends_before_the_transport() -> None:
-    net = network()
+def test_half_precision_ends_before_the_transport(net: SuperGlueNet) -> None:
     a = random_image(150, 9)
     b = seen_again(a, 110, 40, 10)
     whole = net([(a, b)], 100)[0]
@@ -200,33 +195,25 @@ def test_half_precision_ends_before_the_transport() -> None:
     assert agreeing > 0.95
 
 
-def test_sizes_come_from_the_checkpoint() -> None:
-    small = SuperGlueNet(encoder_sizes=(16, 32, 128), num_layers=4)
-    net = superglue(small.state_dict(), "w.pth").eval()
-    assert net.descriptor_size == 128
-    a, b = random_image(20, 0, 128), random_image(30, 1, 128)
-    with torch.inference_mode():
-        expected = small.eval()([(a, b)], 20)[0]
-        torch.testing.assert_close(net([(a, b)], 20)[0], expected, rtol=0, atol=0)
-
-
 def random_scores(rows: int, columns: int, scale: float, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return scale * torch.randn((rows, columns), generator=generator)
 
 
-# up to 300: scores beyond a thousand, where an exponential alone over- and underflows
-@pytest.mark.parametrize("iterations", [1, 2, 100])
-@pytest.mark.parametrize("scale", [0.1, 10.0, 300.0])
-@pytest.mark.parametrize("bin_score", [-300.0, 2.3, 300.0])
-def test_it_is_the_log_domain_definition(scale: float, iterations: int, bin_score: float) -> None:
-    scores, dustbin = random_scores(60, 45, scale), torch.tensor(bin_score)
+# scores beyond a thousand: an exponential alone over- and underflows
+@pytest.mark.parametrize(
+    ("scale", "iterations", "bin_score"), [(0.1, 1, 2.3), (10.0, 2, -300.0), (300.0, 100, 300.0)]
+)
+def test_optimal_transport_equals_the_log_domain_definition(
+    scale: float, iterations: int, bin_score: float
+) -> None:
+    scores = scale * torch.randn((60, 45), generator=torch.Generator().manual_seed(0))
+    dustbin = torch.tensor(bin_score)
     expected = in_logarithm(scores[None].double(), dustbin.double(), iterations)[0]
     exactly = log_optimal_transport([scores.double()], dustbin.double(), iterations)[0]
     torch.testing.assert_close(exactly, expected, rtol=1e-12, atol=1e-9)
     result = log_optimal_transport([scores], dustbin, iterations)[0]
     assert result.dtype == torch.float32
-    # of the result: its logarithm to the last bits of a number of its size, confidences to 1e-5
     torch.testing.assert_close(result.double(), expected, rtol=3e-7, atol=3e-5)
     inner = result[:-1, :-1].double().exp()
     torch.testing.assert_close(inner, expected[:-1, :-1].exp(), rtol=0, atol=1e-5)

@@ -1,4 +1,4 @@
-"""One camera of every COLMAP model, and images whose pixels are known at any place."""
+"""A camera of every COLMAP model, and images of functions of pixel coordinates."""
 
 from __future__ import annotations
 
@@ -30,25 +30,22 @@ WIDTH, HEIGHT = 483, 362
 
 
 def camera_of(model: str) -> Camera:
-    """480-odd pixels wide, off-centre, with the distortion that such lenses have."""
     return Camera(model, WIDTH, HEIGHT, LENSES[model])
 
 
 @pytest.fixture(params=sorted(LENSES))
 def camera(request: pytest.FixtureRequest) -> Camera:
-    """A camera of each model in turn."""
     return camera_of(request.param)
 
 
 @pytest.fixture(params=sorted(set(LENSES) - {"PINHOLE", "SIMPLE_PINHOLE"}))
 def distorted(request: pytest.FixtureRequest) -> Camera:
-    """A camera of each model with distortion in turn."""
     return camera_of(request.param)
 
 
 @pytest.fixture
 def painted() -> Callable[..., NDArray[np.uint8]]:
-    """Draws an image (H, W, 3) of a function of pixel coordinates, sampled at pixels' centres."""
+    """Return a function that samples brightness at pixel centres to an image (H, W, 3)."""
 
     def paint(
         brightness: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
@@ -64,5 +61,4 @@ def painted() -> Callable[..., NDArray[np.uint8]]:
 
 @pytest.fixture
 def lens() -> Callable[[str], Camera]:
-    """The camera of a model."""
     return camera_of

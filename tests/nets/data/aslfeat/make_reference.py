@@ -1,6 +1,6 @@
 """Writes the files of this folder: ASLFeat built of TensorFlow's own operations, and its outputs.
 
-In an environment of its own (TensorFlow is not a dependency of the project):
+In a separate environment (TensorFlow is not a dependency of the project):
 ``pip install tensorflow-cpu==2.21.0 && python make_reference.py``.
 
 The graph is the layer table of the published one (github.com/lzx551402/ASLFeat, configuration
@@ -185,7 +185,7 @@ def keypoints(score, features):
 
 
 def graph(weights, image):
-    """Score map, raw outputs of conv6, and what is detected, of a gray image (1, H, W, 1)."""
+    """Score map, raw outputs of conv6, and keypoints of a gray image (1, H, W, 1)."""
     size = tf.shape(image)[1:3]
     mean, variance = tf.nn.moments(image, [1, 2], keepdims=True)
     x = tf.nn.batch_normalization(image, mean, variance, None, None, EPSILON)

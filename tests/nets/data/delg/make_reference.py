@@ -1,6 +1,6 @@
 """Writes this folder's files with TensorFlow 2.15 (not a dependency of the project).
 
-In an environment of its own::
+In a separate environment::
 
     pip install tensorflow-cpu==2.15.1 tf_keras==2.15.0 tf_slim==1.1.0
     TF_USE_LEGACY_KERAS=1 python make_reference.py
