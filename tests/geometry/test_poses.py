@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
@@ -26,6 +27,7 @@ from megloc_kapture.geometry.poses import (
     movement,
     multiply_quats,
     normalize_quats,
+    perturbed,
     rotate,
     rotation_angles_deg,
     rotation_matrices,
@@ -129,6 +131,20 @@ def test_no_poses() -> None:
 def test_cross_matrix_is_the_cross_product(values: list[float]) -> None:
     a, b = np.array(values[:3]), np.array(values[3:])
     np.testing.assert_allclose(cross_matrix(a) @ b, np.cross(a, b), atol=1e-12)
+
+
+@given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
+def test_a_perturbation_is_the_exponential_of_its_rotation(step: list[float]) -> None:
+    pose = RigidTransform.from_matrix(
+        Rotation.random(rng=1).as_matrix(), np.array([5.0, -3.0, 2.0])
+    )
+    rotation = expm(cross_matrix(np.array(step[:3])))
+    moved = perturbed(pose, np.array(step))
+    expected = rotation @ pose.translation + step[3:]
+    np.testing.assert_allclose(
+        moved.rotation_matrix(), rotation @ pose.rotation_matrix(), atol=1e-12
+    )
+    np.testing.assert_allclose(moved.translation, expected, atol=1e-12)
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 3), st.floats(0.0, 179.0), seeds)

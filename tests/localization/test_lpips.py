@@ -57,7 +57,7 @@ def pictures(count: int = 2, height: int = 80) -> np.ndarray:
 FULL = np.ones((80, 96), bool)
 
 
-def test_it_is_the_networks_distance(files: tuple[Path, Path]) -> None:
+def test_the_distance_equals_the_networks(files: tuple[Path, Path]) -> None:
     plugin = distance(files)
     assert isinstance(plugin, LpipsDistance) and isinstance(plugin, ImageDistance)
     assert plugin.name == "lpips-like-squeeze"

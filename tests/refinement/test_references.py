@@ -1,4 +1,4 @@
-"""References are kept by their content; a map's own images, held out, in a corner of a room."""
+"""References, and the consistency of a map by its held-out images in a corner of a room."""
 
 from __future__ import annotations
 
@@ -45,7 +45,6 @@ Verdict = Callable[[Map], Consistency]
 CAMERA = Camera("PINHOLE", 160, 120, (130.0, 131.3, 80.0, 60.0))
 PX_PER_M = 60
 SLOW = pytest.mark.slow
-# two threads on small images wait for each other most of the time
 QUICK = RenderingOptions(max_references=3)
 # origin, unit vectors of the texture's columns and rows, metres along them
 WALLS = (
@@ -63,9 +62,9 @@ def reference(seed: int) -> RenderingReference:
 
 
 def test_an_image_must_fit_its_camera() -> None:
-    one = reference(0)
+    image = reference(0)
     with pytest.raises(DataError, match="does not fit a camera"):
-        pyramid_of(replace(one, image=one.image[:50]), RenderingOptions())
+        pyramid_of(replace(image, image=image.image[:50]), RenderingOptions())
 
 
 @cache
@@ -79,7 +78,7 @@ def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
 
 
 def view(cam_from_world: RigidTransform, camera: Camera) -> RenderingReference:
-    """Render the corner: every ray meets the nearest wall."""
+    """Render the nearest wall of every ray."""
     h, w = camera.height, camera.width
     px = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), axis=-1).reshape(-1, 2)
     rays = bearing_rays(camera, px)
@@ -131,7 +130,7 @@ def corner() -> Map:
 
 
 def scene_of(images: Map, new_scene: Callable[..., Any]) -> Any:
-    """A map of images in memory; nothing of queries."""
+    """Return a map of images in memory."""
     return new_scene(
         {name: each.cam_from_world for name, each in images.items()},
         {name: each.camera for name, each in images.items()},
@@ -142,7 +141,7 @@ def scene_of(images: Map, new_scene: Callable[..., Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def verdict(new_scene: Callable[..., Any]) -> Verdict:
-    """Judges a map by its images."""
+    """Return a function that judges a map by its images."""
 
     def judge(images: Map) -> Consistency:
         rendering, scene = Rendering(QUICK), scene_of(images, new_scene)
@@ -161,7 +160,7 @@ def exact(corner: Map, verdict: Verdict) -> Consistency:
 
 
 def changed(images: Map, change: Callable[[int, RenderingReference], dict[str, Any]]) -> Map:
-    """Every image with the fields that ``change`` gives for its number."""
+    """Replace fields of every image; ``change`` gets its number."""
     return {n: replace(each, **change(k, each)) for k, (n, each) in enumerate(images.items())}
 
 
@@ -170,7 +169,7 @@ def posed(images: Map, change: Callable[[int, RigidTransform], RigidTransform]) 
 
 
 def with_depth(images: Map, change: Callable[[DepthView], dict[str, Any]]) -> Map:
-    """Every image with these fields of its depth changed."""
+    """Replace fields of every image's depth."""
     return changed(images, lambda _, each: {"depth": replace(each.depth, **change(each.depth))})
 
 
@@ -179,15 +178,13 @@ def test_an_exact_map_is_consistent(exact: Consistency) -> None:
     assert exact.median.moved_m < 0.005 and exact.median.turned_deg < 0.08
 
 
-def test_poses_that_are_off_contradict_each_other(corner: Map, verdict: Verdict) -> None:
+def test_wrong_poses_contradict_each_other(corner: Map, verdict: Verdict) -> None:
     result = verdict(posed(corner, lambda k, each: displaced(each, k, 0.02, 0.5)))
     assert "contradicts itself" in result.reason
     assert result.median.moved_m > 0.01 and result.median.turned_deg > 0.25
 
 
-def test_depth_that_is_shifted_against_colour_shows_between_views(
-    corner: Map, verdict: Verdict
-) -> None:
+def test_shifted_depth_contradicts_other_views(corner: Map, verdict: Verdict) -> None:
     shifted = with_depth(corner, lambda view: {"depth_m": np.roll(view.depth_m, 7, axis=1)})
     assert "contradicts itself" in verdict(shifted).reason
 
@@ -211,7 +208,7 @@ def test_neither_unit_nor_frame_matters(
 
 
 @SLOW
-def test_images_that_share_a_displacement_do_not_vouch_for_each_other(verdict: Verdict) -> None:
+def test_images_with_a_shared_displacement_do_not_confirm_each_other(verdict: Verdict) -> None:
     # two scans of three views each, a centimetre apart
     centers = [(-0.6, 0.0, 0.0), (0.4, 0.1, 0.2)]
     scans = {
@@ -227,7 +224,7 @@ def test_images_that_share_a_displacement_do_not_vouch_for_each_other(verdict: V
     assert "6 of 6" in verdict(off).reason
 
 
-def test_images_that_say_nothing_of_each_other(corner: Map, verdict: Verdict) -> None:
+def test_images_without_parallax_or_depth_are_not_judged(corner: Map, verdict: Verdict) -> None:
     # of one position
     rotations = [each.rotation_matrix() for each in POSES]
     center = POSES[2].center()
@@ -243,14 +240,14 @@ def test_images_that_say_nothing_of_each_other(corner: Map, verdict: Verdict) ->
 
 
 def test_images_behind_a_wall_are_no_reference(corner: Map, new_scene: Callable[..., Any]) -> None:
-    # two rooms back to back: what looks the same way from behind the wall sees nothing of it
+    # two rooms back to back: cameras behind the wall do not see it
     behind = {
         f"behind-{k}.png": view(
             RigidTransform.from_matrix(np.eye(3), -np.array([0.3 * k, 0.0, -0.5])), CAMERA
         )
         for k in range(3)
     }
-    # the same pictures and depths, said to be 6 m further on
+    # the same images and depths, 6 m farther on
     onwards = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -6.0))
     shifted = posed(behind, lambda _, each: onwards @ each)
     scene = scene_of({"0.png": corner["0.png"], **shifted}, new_scene)
@@ -270,14 +267,14 @@ def test_most_of_the_images_decide(wrong: list[bool]) -> None:
     assert result.median.squared_distance == pytest.approx(np.median(values))
 
 
-def test_few_images_decide_nothing_and_no_more_are_asked_for_than_needed() -> None:
+def test_few_images_decide_nothing_and_many_are_not_used() -> None:
     few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
     assert "not known" in few.reason and few.images == MIN_TESTED - 1
     assert judge_consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
     asked = iter([known(1.0)] * 100)
     assert judge_consistency(asked).images == MAX_TESTED
     assert len(list(asked)) == 100 - MAX_TESTED
-    # what alignment does not resolve contradicts nothing
+    # displacements below the resolution of the alignment do not contradict
     assert known(1e4, 0.06).contradicts and not known(1e4, 0.04).contradicts
     assert not known(CHI2_OF_CHANCE, 100.0).contradicts
     assert Rendering().require_consistent_map
