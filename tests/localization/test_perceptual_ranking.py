@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 import pytest
@@ -46,6 +47,7 @@ def standing(room: int, x: float = 0.0, z: float = 0.0) -> RigidTransform:
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (-(APART_M * room + x), 0.0, -z))
 
 
+@cache
 def photograph(room: int, pose: RigidTransform) -> NDArray[np.uint8]:
     columns, rows = np.meshgrid(np.arange(CAMERA.width) + 0.5, np.arange(CAMERA.height) + 0.5)
     rays = bearing_rays(CAMERA, np.stack([columns.ravel(), rows.ravel()], axis=1))

@@ -1,4 +1,4 @@
-"""Mistakes in maps are named; correct maps have none."""
+"""Mistakes in maps are named; correct maps pass."""
 
 from __future__ import annotations
 

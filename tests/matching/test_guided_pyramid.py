@@ -121,8 +121,8 @@ def test_keypoints_of_a_variant_are_mapped_to_the_image(variant: ImageVariant) -
 def test_masked_pixels_have_no_keypoints_in_any_variant() -> None:
     mask = np.ones((240, 320), bool)
     mask[50:150, 100:250] = False
-    actual, _ = extract_variants(IMAGE, mask, ALL_VARIANTS[::2], extract, like=LIKE)
-    assert len(actual) == len(ALL_VARIANTS[::2])
+    actual, _ = extract_variants(IMAGE, mask, ALL_VARIANTS[1::3], extract, like=LIKE)
+    assert len(actual) == len(ALL_VARIANTS[1::3])
     for each in actual:
         x, y = np.floor(each.keypoints_px[:, :2]).astype(int).T
         assert len(x) > 5

@@ -177,7 +177,7 @@ def test_unused_tensors_may_be_added_or_missing(tmp_path: Path) -> None:
     ],
 )
 def test_mismatched_weights_are_named(tmp_path: Path, key: str, kept: Any, message: str) -> None:
-    tensors = published.tensors()
+    tensors = dict(published.tensors())
     value = tensors.pop(key)
     if kept is not None:
         tensors[key] = value[kept].clone()

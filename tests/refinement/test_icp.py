@@ -170,12 +170,11 @@ def test_the_offset_between_depth_and_colour_counts(
     furnished: Any, scene_of: Callable[..., Any]
 ) -> None:
     start = displaced(QUERY, 1, 0.03, 1.0)
-    for scene in (furnished, scene_of(query_offset=IDENTITY, map_offset=OFFSET)):
-        assert_accurate(refine(scene, start))
-        # the same depth without the offset
-        views = {n: replace(v, image_from_depth=IDENTITY) for n, v in scene.depths.items()}
-        ignored = refine(replace(scene, depths=views), start)
-        assert pose_errors(ignored.cam_from_world, QUERY)[0] > 0.02
+    assert_accurate(refine(scene_of(query_offset=IDENTITY, map_offset=OFFSET), start))
+    # the query's offset replaced by none
+    views = {n: replace(v, image_from_depth=IDENTITY) for n, v in furnished.depths.items()}
+    wrong = refine(replace(furnished, depths=views), start)
+    assert pose_errors(wrong.cam_from_world, QUERY)[0] > 0.02
 
 
 @pytest.mark.parametrize(("name", "seed"), [("wall", None), ("corridor", 0)])

@@ -214,8 +214,8 @@ def test_poses_beyond_a_bound_are_rejected(case: Case) -> None:
     for options, reason in (
         ({"max_translation_m": 0.05}, "would move"),
         ({"max_rotation_deg": 1.0}, "would turn"),
-        ({"min_correlation": 0.99}, "correlate"),
-        ({"min_significance": 20.0}, "cost improves"),
+        ({"min_correlation": 0.99}, "correlation"),
+        ({"min_significance": 20.0}, "standard errors"),
         ({"min_overlap": 1.0}, "cover"),
     ):
         refined = run(case, start, **options)

@@ -25,7 +25,7 @@ IDENTITY = RigidTransform.identity()
 
 
 @cache
-def _texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
+def wall_texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
     rng = np.random.default_rng(seed)
     image = np.zeros((height, width, 3))
     for sigma in (1.5, 4.0, 12.0):
@@ -43,7 +43,7 @@ def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
     size = (CAMERA.width, CAMERA.height)
     image = np.full((CAMERA.height, CAMERA.width, 3), 128, dtype=np.uint8)
     for seed, (origin, along, width, height) in enumerate(WALLS):
-        texture = _texture(width * TEXTURE_PX_PER_M, height * TEXTURE_PX_PER_M, seed)
+        texture = wall_texture(width * TEXTURE_PX_PER_M, height * TEXTURE_PX_PER_M, seed)
         world_from_texture = np.column_stack(
             [along / TEXTURE_PX_PER_M, [0, 1 / TEXTURE_PX_PER_M, 0], origin]
         )
