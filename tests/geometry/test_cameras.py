@@ -1,4 +1,4 @@
-"""Camera models and their derivatives against formulas, OpenCV and COLMAP."""
+"""Camera models and their derivatives compared with formulas, OpenCV and COLMAP."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from camera_models import STRONG
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import (
@@ -101,9 +102,8 @@ def test_project_applies_the_pose() -> None:
     np.testing.assert_allclose(project(camera("PINHOLE"), pose, points), expected, atol=1e-9)
 
 
-def test_behind_the_camera_and_where_distortion_cannot_be_undone_is_nan() -> None:
-    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
-    assert np.isnan(normalized_from_px(strong, np.array([[0.0, 0.0]]))).all()
+def test_points_behind_the_camera_and_pixels_without_rays_are_nan() -> None:
+    assert np.isnan(normalized_from_px(STRONG, np.array([[0.0, 0.0]]))).all()
     pixels = px_from_cam(camera("PINHOLE"), np.array([[0.1, 0.1, -1.0], [0, 0, 0], [0.1, 0, 1]]))
     assert np.isnan(pixels[:2]).all() and np.isfinite(pixels[2]).all()
     assert np.isnan(
@@ -119,9 +119,6 @@ def test_the_models_number_of_parameters_is_colmaps() -> None:
         assert not pycolmap.Camera(model=model, params=[0.0] * (count + 1)).verify_params()
 
 
-# --------------------------------------------------------------------------------- derivatives
-
-
 def colmap(given: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
     theirs = pycolmap.Camera(
         model=given.model, width=given.width, height=given.height, params=list(given.params)
@@ -130,7 +127,7 @@ def colmap(given: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def various_points() -> NDArray[np.float64]:
-    """In front of a camera: over its view, near its axis, and on it."""
+    """Return points in front of a camera: in its view, near its axis, and on its axis."""
     rng = np.random.default_rng(0)
     result = rng.uniform((-1.2, -1.0, 1.0), (1.2, 1.0, 1.5), (400, 3)) * rng.uniform(
         0.1, 50, (400, 1)
@@ -141,7 +138,7 @@ def various_points() -> NDArray[np.float64]:
 
 
 def differences(given: Camera, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Central differences with Richardson's extrapolation."""
+    """Return central differences of COLMAP's pixels with Richardson's extrapolation."""
 
     def central(step: float) -> NDArray[np.float64]:
         steps = step * at[:, 2:3]
@@ -155,7 +152,7 @@ def differences(given: Camera, at: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def assert_colmaps(given: Camera, at: NDArray[np.float64]) -> None:
-    """Pixels and derivatives are COLMAP's."""
+    """Compare pixels and derivatives with COLMAP's."""
     pixels, jacobian = project_with_jacobian(given, at)
     np.testing.assert_allclose(pixels, colmap(given, at), atol=1e-9, rtol=0)
     assert jacobian.shape == (len(at), 2, 3)
@@ -168,17 +165,17 @@ def test_pixels_and_derivatives_are_colmaps(model: str) -> None:
     assert_colmaps(camera(model), various_points())
 
 
-@pytest.mark.parametrize("omega", [1e-9, 1e-3, 0.0099, 0.0101, 0.5, 2.0])
+@pytest.mark.parametrize("omega", [1e-9, 0.0099, 0.0101, 2.0])
 def test_the_field_of_view_model_at_its_expansions(omega: float) -> None:
     given, at = camera("FOV", (omega,)), various_points()
     pixels, _ = project_with_jacobian(given, at)
     np.testing.assert_allclose(pixels, colmap(given, at), atol=1e-9, rtol=0)
-    # COLMAP's expansions do not meet its formula where they end: no differences across that
+    # COLMAP's expansions are not continuous where they end
     radius = np.linalg.norm(at[:, :2] / at[:, 2:], axis=1)
     assert_colmaps(given, at[np.abs(radius - 0.01) > 1e-3])
 
 
-def test_nothing_is_seen_behind_the_camera() -> None:
+def test_points_behind_the_camera_have_no_derivatives() -> None:
     behind = np.array([[0.0, 0.0, -1.0], [0.1, 0.2, 0.0], [np.nan, 0.0, 1.0], [0.0, 0.0, 2.0]])
     pixels, jacobian = project_with_jacobian(camera("OPENCV"), behind)
     assert np.isnan(pixels[:2]).all() and np.isnan(jacobian[:2]).all()

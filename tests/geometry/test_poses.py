@@ -1,4 +1,4 @@
-"""Pose algebra on arrays against scipy, RigidTransform and hand-made cases."""
+"""Pose algebra on arrays compared with scipy and RigidTransform; alignments."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
@@ -26,6 +27,7 @@ from megloc_kapture.geometry.poses import (
     movement,
     multiply_quats,
     normalize_quats,
+    perturbed,
     rotate,
     rotation_angles_deg,
     rotation_matrices,
@@ -66,11 +68,11 @@ def test_small_and_large_angles_keep_their_digits(exponent: float, seed: int) ->
     angle_deg = 10.0**exponent
     base, _ = random_poses(seed, 1)
     turned = multiply_quats(about_x(angle_deg), base)
-    # an arccos would be off by 1e-6 degrees here
+    # an arccos would have an error of 1e-6 degrees
     assert rotation_angles_deg(turned, base)[0] == pytest.approx(angle_deg, rel=1e-12, abs=5e-14)
 
 
-def test_equal_rotations_are_exactly_zero_apart_and_half_a_turn_is_180_degrees() -> None:
+def test_angles_of_equal_and_opposite_rotations_are_exact() -> None:
     quat = np.array([[0.5, 0.5, 0.5, 0.5]])
     assert rotation_angles_deg(quat, quat)[0] == 0.0
     assert rotation_angles_deg(quat, -quat)[0] == 0.0
@@ -116,7 +118,7 @@ def test_arrays_agree_with_the_value_type(seed: int) -> None:
     np.testing.assert_allclose(centers, [pose.center() for pose in first], atol=1e-12)
 
 
-def test_no_poses() -> None:
+def test_empty_arrays_of_poses() -> None:
     quats, translations = stack_poses([])
     assert quats.shape == (0, 4) and translations.shape == (0, 3)
     assert camera_centers(quats, translations).shape == (0, 3)
@@ -129,6 +131,20 @@ def test_no_poses() -> None:
 def test_cross_matrix_is_the_cross_product(values: list[float]) -> None:
     a, b = np.array(values[:3]), np.array(values[3:])
     np.testing.assert_allclose(cross_matrix(a) @ b, np.cross(a, b), atol=1e-12)
+
+
+@given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
+def test_a_perturbation_is_the_exponential_of_its_rotation(step: list[float]) -> None:
+    pose = RigidTransform.from_matrix(
+        Rotation.random(rng=1).as_matrix(), np.array([5.0, -3.0, 2.0])
+    )
+    rotation = expm(cross_matrix(np.array(step[:3])))
+    moved = perturbed(pose, np.array(step))
+    expected = rotation @ pose.translation + step[3:]
+    np.testing.assert_allclose(
+        moved.rotation_matrix(), rotation @ pose.rotation_matrix(), atol=1e-12
+    )
+    np.testing.assert_allclose(moved.translation, expected, atol=1e-12)
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 3), st.floats(0.0, 179.0), seeds)
@@ -147,17 +163,17 @@ def test_movement_is_of_the_centre_and_about_any_axis(
     assert turned_deg == pytest.approx(angle_deg, abs=1e-6)
 
 
-def test_the_factor_is_that_of_the_normal_distribution() -> None:
+def test_the_deviation_is_exact_for_normal_quartiles() -> None:
     quarter = NormalDist().inv_cdf(0.75)
     assert deviation_by_median(np.array([-quarter, quarter])) == pytest.approx(1.0, rel=1e-15)
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.1])
-def test_outliers_hardly_move_it(wrong: float) -> None:
+def test_outliers_change_the_deviation_little(wrong: float) -> None:
     rng = np.random.default_rng(3)
     values = rng.normal(scale=0.2, size=200_000)
     values[rng.random(len(values)) < wrong] = 1e6
-    # of a tenth of outliers the median is the quantile of 5/9 of the others
+    # with a tenth of outliers, the median is the 5/9 quantile of the others
     expected = 0.2 * NormalDist().inv_cdf(0.5 + 0.25 / (1 - wrong)) / NormalDist().inv_cdf(0.75)
     assert deviation_by_median(values) == pytest.approx(expected, rel=0.01)
 
@@ -167,11 +183,11 @@ TURN = Rotation.from_rotvec([0.3, -1.2, 0.8]).as_matrix()
 
 
 def on_earth(enu: NDArray[np.float64]) -> dict[str, GeoPosition]:
-    return {f"{at}": geodetic(EARTH.apply(one[None])[0]) for at, one in enumerate(enu)}
+    return {f"{at}": geodetic(EARTH.apply(xyz[None])[0]) for at, xyz in enumerate(enu)}
 
 
 def in_map(enu: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    return {f"{at}": one @ TURN / 7.5 + 3.0 for at, one in enumerate(enu)}
+    return {f"{at}": xyz @ TURN / 7.5 + 3.0 for at, xyz in enumerate(enu)}
 
 
 def walk(number: int, width_m: float = 12.0) -> NDArray[np.float64]:
@@ -207,7 +223,9 @@ def test_noise_and_two_positions_far_off() -> None:
         (np.ones((4, 3)), 4, "at one place"),
     ],
 )
-def test_positions_that_tell_no_scale(enu: NDArray[np.float64], known: int, reason: str) -> None:
+def test_positions_that_do_not_determine_the_scale(
+    enu: NDArray[np.float64], known: int, reason: str
+) -> None:
     positions = dict(list(on_earth(enu).items())[:known])
     with pytest.raises(DataError, match=reason):
         align_to_earth(in_map(enu), positions)
@@ -215,7 +233,7 @@ def test_positions_that_tell_no_scale(enu: NDArray[np.float64], known: int, reas
 
 @pytest.mark.parametrize("on_a_line", [False, True])
 def test_an_alignment_ignores_wrong_poses(on_a_line: bool) -> None:
-    """Of similarities, half of the poses right; a line of centres alone would not fix the roll."""
+    """Half of the poses are right; centres on a line alone would not determine the roll."""
     scale, turn, offset = 0.2, Rotation.random(random_state=1), np.array([100.0, -50.0, 7.0])
     rng = np.random.default_rng(0)
     centers = rng.normal(size=(40, 3)) * ([10.0, 0.0, 0.0] if on_a_line else 10.0)

@@ -1,4 +1,4 @@
-"""Warping: analytic planes under many camera models, a search by hand, the synthetic world."""
+"""Warping of planes under many camera models, and of a board in front of a wall."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -50,7 +50,7 @@ def points_of(
 
 
 def paint(points: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A smooth colour of every place in the world, (N, 3)."""
+    """Return a smooth colour (N, 3) of points in the world."""
     phase = points @ np.array([[1.3, 0.4, 0.7], [0.5, 1.2, -0.6], [0.3, -0.8, 0.9]])
     return np.round(127.5 + 100 * np.sin(phase)).astype(np.uint8)
 
@@ -86,7 +86,7 @@ def turned(x_deg: float, y_deg: float, shift: tuple[float, float, float]) -> Rig
 
 
 def assert_painted(view: WarpedView, points: NDArray[np.float64], where: NDArray[np.bool_]) -> None:
-    """The pixels show the colours of points of the world."""
+    """Compare pixels with the colours of points."""
     difference = np.abs(view.image.reshape(-1, 3)[where].astype(int) - paint(points[where]))
     assert difference.max() <= 3
 
@@ -94,7 +94,6 @@ def assert_painted(view: WarpedView, points: NDArray[np.float64], where: NDArray
 WALL: Plane = (np.array([0.1, -0.05, 1.0]), 4.0)
 
 
-@settings(max_examples=25)
 @given(
     camera=st.sampled_from(CAMERAS),
     normal=st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.just(1.0)),
@@ -116,17 +115,17 @@ def test_an_image_warped_to_its_own_view_is_itself(
     image = np.random.default_rng(seed).integers(0, 256, (60, 80, 3), dtype=np.uint8)
     source = WarpSource(image, camera, pose, depth.astype(np.float32), camera)
     view = warp_to_view([source], camera, pose)
-    # the outermost centres lie on the surface's rim, where rounding decides
+    # the outermost centres are on the rim of the surface
     assert view.valid[1:-1, 1:-1].all()
     difference = np.abs(view.image.astype(int) - image)[view.valid]
-    assert difference.max() <= 1 + 255 * 0.02  # OpenCV looks up at 1/32 of a pixel
+    assert difference.max() <= 1 + 255 * 0.02  # OpenCV interpolates at 1/32 of a pixel
     np.testing.assert_allclose(view.depth_m[view.valid], depth[view.valid], rtol=1e-5)
     assert (view.source[view.valid] == 0).all()
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
-@pytest.mark.parametrize("other", [CAMERAS[0], CAMERAS[4]], ids=lambda c: c.model)
-def test_a_warped_plane_equals_the_true_view(camera: Camera, other: Camera) -> None:
+def test_a_warped_plane_equals_the_true_view(camera: Camera) -> None:
+    other = CAMERAS[4]
     there = turned(3.0, -6.0, (0.3, -0.1, 0.2))
     view = warp_to_view([on_plane(other, STILL, WALL)], camera, there)
     depth = plane_depth(camera, there, WALL)
@@ -153,7 +152,7 @@ def test_depth_of_a_separate_camera() -> None:
     valid = view.valid.ravel()
     assert valid.mean() > 0.6
     assert_painted(view, points, valid)
-    # with the offset forgotten it would be another picture
+    # without the offset the depth is wrong
     forgotten = warp_to_view([replace(right, image_from_depth=STILL)], CAMERAS[1], there)
     truth = plane_depth(CAMERAS[1], there, WALL)
     np.testing.assert_allclose(view.depth_m.ravel()[valid], truth[valid], rtol=2e-4)
@@ -169,7 +168,7 @@ def test_a_view_from_nearer_has_no_holes() -> None:
     assert_painted(view, points, view.valid.ravel())
 
 
-@pytest.mark.parametrize("scale", [0.5, 0.37, 2.0])
+@pytest.mark.parametrize("scale", [0.37, 2.0])
 def test_a_scaled_view_shows_the_same(scale: float) -> None:
     there = turned(2.0, 4.0, (0.1, 0.0, 0.1))
     camera = CAMERAS[4]
@@ -188,7 +187,7 @@ def test_a_scaled_view_shows_the_same(scale: float) -> None:
 
 
 def board(camera: Camera, pose: RigidTransform) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Depth (N,) of a board in front of a wall, and where the board is; a search by hand."""
+    """Return the depth (N,) of a board in front of a wall, and the board's pixels."""
     wall = plane_depth(camera, pose, (np.array([0.0, 0.0, 1.0]), 4.0))
     front = plane_depth(camera, pose, (np.array([0.0, 0.0, 1.0]), 2.0))
     at = points_of(camera, pose, front)
@@ -206,7 +205,7 @@ def board_source(pose: RigidTransform) -> WarpSource:
 def board_truth(
     view: RigidTransform, sources: list[RigidTransform]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Points of a view, whether any source sees each, and which are clear of all edges."""
+    """Return a view's points, those that a source sees, and those away from all edges."""
     camera = CAMERAS[1]
     depth, on_board = board(camera, view)
     points = points_of(camera, view, depth)
@@ -241,20 +240,21 @@ def check_board(view: WarpedView, truth: RigidTransform, sources: list[RigidTran
     assert_painted(view, points, clear & valid)
 
 
-def test_several_references_fill_each_others_holes() -> None:
+def test_references_fill_each_others_holes() -> None:
     aside, other = turned(0.0, 0.0, (-0.6, 0.0, 0.0)), turned(0.0, 0.0, (-1.0, 0.2, 0.0))
     sources = [board_source(STILL), board_source(other)]
-    one = warp_to_view(sources[:1], CAMERAS[1], aside)
-    check_board(one, aside, [STILL])  # pixels hidden or covered by the board are masked
-    assert (one.image[~one.valid] == 0).all() and (one.source[~one.valid] == -1).all()
+    single = warp_to_view(sources[:1], CAMERAS[1], aside)
+    check_board(single, aside, [STILL])  # pixels hidden by the board are masked
+    empty = ~single.valid
+    assert (single.image[empty] == 0).all() and (single.source[empty] == -1).all()
     both = warp_to_view(sources, CAMERAS[1], aside)
-    assert both.valid.sum() > one.valid.sum() + 100
+    assert both.valid.sum() > single.valid.sum() + 100
     assert set(np.unique(both.source)) >= {0, 1}
     points, seen, clear = board_truth(aside, [STILL, other])
     np.testing.assert_array_equal(both.valid.ravel()[clear], seen[clear])
 
 
-def test_of_two_references_the_nearer_in_angle_counts() -> None:
+def test_the_reference_at_the_smaller_angle_is_used() -> None:
     there = turned(0.0, 1.0, (0.05, 0.0, 0.0))
     far = turned(0.0, -12.0, (0.9, 0.0, 0.0))
     sources = [on_plane(CAMERAS[1], far, WALL), on_plane(CAMERAS[1], STILL, WALL)]
@@ -265,14 +265,14 @@ def test_of_two_references_the_nearer_in_angle_counts() -> None:
     assert (view.source[at_both] == 1).all()
 
 
-def test_a_surface_from_behind_hides_and_shows_nothing() -> None:
-    behind = turned(0.0, 180.0, (0.0, 0.0, 8.0))  # beyond the wall, looking back at it
+def test_a_surface_from_behind_is_invalid() -> None:
+    behind = turned(0.0, 180.0, (0.0, 0.0, 8.0))  # behind the wall
     view = warp_to_view([on_plane(CAMERAS[1], STILL, WALL)], CAMERAS[1], behind)
     assert not view.valid.any()
     assert (view.depth_m > 0).mean() > 0.5
 
 
-def test_masked_pixels_and_missing_depth_are_not_shown() -> None:
+def test_masked_pixels_and_missing_depth_are_invalid() -> None:
     mask = np.ones((60, 80), bool)
     mask[20:30, 30:50] = False
     masked = on_plane(CAMERAS[1], STILL, WALL, mask=mask)
@@ -287,7 +287,7 @@ def test_masked_pixels_and_missing_depth_are_not_shown() -> None:
 
 
 def test_points_that_only_the_depth_camera_sees_are_hidden() -> None:
-    # the sensor far to the side sees the wall behind the board, the camera does not
+    # the depth sensor sees the wall behind the board, the camera does not
     camera, beside = CAMERAS[1], turned(0.0, 0.0, (0.6, 0.0, 0.0))
     depth, _ = board(camera, beside.inverse())
     colour = board_source(STILL).image

@@ -20,7 +20,7 @@ MODEL, LIST = "3D-models/aachen_cvpr2018_db.nvm", "3D-models/database_intrinsics
 DAY_LIST = "queries/day_time_queries_with_intrinsics.txt"
 NIGHT_LIST = "queries/night_time_queries_with_intrinsics.txt"
 
-# a pose that tells centre from translation, and a distortion whose sign shows
+# poses with different centre and translation, and distortions of both signs
 NVM = """NVM_V3\x20
 
 3
@@ -74,7 +74,7 @@ def write_v1_0(root: Path) -> Path:
     put(root / LIST, INTRINSICS)
     put(root / DAY_LIST, query_list(DAY))
     put(root / NIGHT_LIST, query_list(NIGHT))
-    # not what the adapter reads, and not even valid
+    # files that the adapter must ignore
     put(root / "queries/day_time_queries_without_intrinsics.txt", "\n".join(DAY))
     put(root / "3D-models/aachen_cvpr2018_db.list.txt", "\n".join(DATABASE))
     for name in (*DATABASE, *DAY, *NIGHT, UNLISTED):

@@ -16,7 +16,7 @@ def fountain(shared_data: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def fountain_workspace(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Our run of the scene with the default preset; not to be written into."""
+    """Run the scene with the default preset; tests must not write into it."""
     workspace = tmp_path_factory.mktemp("fountain") / "workspace"
     megloc("eval", "kapture", "--root", fountain, "--workspace", workspace)
     return workspace

@@ -1,4 +1,4 @@
-"""A small 4Seasons in its official layout, written by hand, and what is read of one."""
+"""A small 4Seasons in its official layout, written by hand, and readers of the result."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Camera, RigidTransform
 
-# at odd nanoseconds: a float of 64 bits would move them
+# odd nanoseconds, which a 64-bit float cannot represent
 A, B = 1600000000000000001, 1600000000033333339
 DAY, SNOW, RAIN = (f"recording_{date}_10-00-00" for date in ("2020-05-01", "2021-01-02", "2021-03"))
 CAMERA = Camera("PINHOLE", 8, 4, (5.0, 5.0, 4.25, 1.75))
@@ -62,7 +62,7 @@ def write_recording(
 
 
 def write_two_recordings(root: Path) -> Path:
-    """One with poses, the images of two frames kept, and one without."""
+    """Write a recording with poses and images of two frames, and a recording without."""
     write_calibration(root / "calibration")
     write_recording(root, DAY, (A, B))
     write_recording(root, SNOW, (A + 5, B + 5), rows=None)

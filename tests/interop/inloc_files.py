@@ -27,7 +27,7 @@ VIEWS = [(yaw, pitch) for yaw in range(0, 360, 30) for pitch in (-30, 0, 30)]
 
 
 def scanned(yaw_deg: int, pitch_deg: int) -> Floats:
-    """What the scanner in the box measures in a cutout's pixels, in its own frame."""
+    """Return the points (H, W, 3) of a cutout's pixels in the scanner's frame."""
     yaw, pitch = np.radians([yaw_deg, pitch_deg])
     forward = np.array([-np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
     right = np.array([np.sin(yaw), np.cos(yaw), 0.0])

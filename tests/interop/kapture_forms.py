@@ -57,7 +57,7 @@ def robotcar_with_kapture(official: Path, place: Path, size_px: tuple[int, int])
 
 
 def without_images(folder: Path, gone: str) -> None:
-    """Take the images that have some text in their names out of a kapture folder's records."""
+    """Remove the images with a text in their names from a kapture folder's records."""
     data = kapture_from_dir(str(folder))
     for time, sensor, name in list(kapture.flatten(data.records_camera)):
         if gone in name:
@@ -66,10 +66,7 @@ def without_images(folder: Path, gone: str) -> None:
 
 
 def assert_same_images(result: KaptureData, expected: KaptureData, *, atol: float = 0.0) -> None:
-    """The same images in the same order, with the same cameras and poses.
-
-    Ids of sensors are each form's own.
-    """
+    """Compare images, their order, cameras and poses; ids of sensors may differ."""
     assert list(result.records_camera.values()) == list(expected.records_camera.values())
     for name in expected.records_camera.values():
         assert result.camera_of(name) == expected.camera_of(name)
@@ -82,7 +79,7 @@ def assert_same_images(result: KaptureData, expected: KaptureData, *, atol: floa
 def assert_same_dataset(
     result: OfficialDataset, expected: OfficialDataset, *, atol: float = 0.0
 ) -> None:
-    """The same images and tables, the order of names and lines of the summary included."""
+    """Compare images, tables, order of names and lines of the summary."""
     assert_same_images(result.mapping, expected.mapping, atol=atol)
     assert_same_images(result.query, expected.query, atol=atol)
     assert (result.query_gt is None) == (expected.query_gt is None)
@@ -95,7 +92,7 @@ def assert_same_dataset(
 
 
 def assert_linked(dataset: OfficialDataset, output: Path, images: Path) -> None:
-    """What is written has links to the dataset's images, each in its own part, and no others."""
+    """Check that each part has links to exactly its images."""
     write_official(dataset, output)
     for part in ("mapping", "query"):
         folder = KaptureFolder(output / part)

@@ -1,4 +1,4 @@
-"""kapture's and kapture-localization's own tools, run as their users run them."""
+"""The tools of kapture and kapture-localization, run by the command line."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ needs_kapture_localization = pytest.mark.skipif(
 
 
 def kloc(tool: str, *arguments: str | Path) -> str:
-    """Run one of kapture-localization's tools through the adapter; returns what it printed."""
+    """Run a tool of kapture-localization through the adapter; return its output."""
     return _run([sys.executable, kloc_tools.__file__, tool, *map(str, arguments)])
 
 
 def kapture_tool(tool: str, *arguments: str | Path) -> str:
-    """Run one of kapture's console scripts; returns what it printed."""
+    """Run a console script of kapture; return its output."""
     return _run([str(Path(sys.executable).with_name(tool)), *map(str, arguments)])
 
 
 def megloc(*arguments: str | Path) -> str:
-    """Run our command; returns what it printed."""
+    """Run ``megloc``; return its output."""
     return _run([str(Path(sys.executable).with_name("megloc")), *map(str, arguments)])
 
 
@@ -42,7 +42,7 @@ def _run(command: Sequence[str]) -> str:
 
 
 def proxy(place: Path, sensors_of: Path, linked: dict[str, Path]) -> Path:
-    """A kapture folder made of links: another's sensors, and data by place in reconstruction/."""
+    """Make a kapture folder of links to sensors and to data below reconstruction/."""
     place.mkdir(parents=True)
     (place / "sensors").symlink_to(sensors_of.resolve() / "sensors")
     for name, target in linked.items():
@@ -53,7 +53,7 @@ def proxy(place: Path, sensors_of: Path, linked: dict[str, Path]) -> Path:
 
 
 def merged(place: Path, mapping: Path, query: Path, *, skip: Sequence[str] = ()) -> Path:
-    """Map and query in one kapture folder, by kapture's own merge; ``skip`` names data parts."""
+    """Merge map and query by kapture's tool; ``skip`` names data to leave out."""
     skipped = ["-s", *skip] if skip else []
     images = ["--image_transfer", "link_absolute", "--keep-sensor-ids"]
     kapture_tool("kapture_merge", "-i", mapping, query, "-o", place, *images, *skipped)
@@ -61,10 +61,7 @@ def merged(place: Path, mapping: Path, query: Path, *, skip: Sequence[str] = ())
 
 
 def pose_errors(result: Path, truth: Path) -> dict[str, tuple[float, float]]:
-    """(metres, degrees) of each image of ``truth`` that ``result`` has a pose for.
-
-    Poses are read and compared by kapture alone, images are identified by name.
-    """
+    """Return the errors (metres, degrees) of each localized image, read and compared by kapture."""
     actual, expected = _poses(result), _poses(truth)
     return {
         name: world_pose_transform_distance(actual[name], expected[name])

@@ -21,7 +21,7 @@ def put(path: Path, text: str) -> None:
     path.write_text(text)
 
 
-# which moments lie in which location, and what the lists of version 2 say of them
+# location of each time, and the lists of version 2
 REFERENCE = {1: "001", 2: "001", 3: "002"}
 QUERIES = {11: ("dawn", "001"), 12: ("dawn", "002"), 13: ("night", "001"), 14: ("rain", "002")}
 TRAIN, TEST, NEITHER = (11, 13), (12,), 14

@@ -24,7 +24,7 @@ def read_pose_file(path: Path) -> dict[str, np.ndarray]:
     return poses
 
 
-def test_its_ltvl_export_is_our_pose_file(fountain_workspace: Path, tmp_path: Path) -> None:
+def test_kaptures_pose_file_equals_ours(fountain_workspace: Path, tmp_path: Path) -> None:
     exported = tmp_path / "exported.txt"
     localized = fountain_workspace / "localized"
     kapture_tool("kapture_export_LTVL2020", "-i", localized, "-o", exported, "--full_file_name")
@@ -36,7 +36,7 @@ def test_its_ltvl_export_is_our_pose_file(fountain_workspace: Path, tmp_path: Pa
         np.testing.assert_allclose(pose, expected[name], rtol=0, atol=1e-9)
 
 
-def test_its_colmap_export_reads_our_map(fountain_workspace: Path, tmp_path: Path) -> None:
+def test_kaptures_colmap_export_reads_our_map(fountain_workspace: Path, tmp_path: Path) -> None:
     ours = fountain_workspace / "map"
     database, model = tmp_path / "colmap.db", tmp_path / "model"
     kapture_tool(

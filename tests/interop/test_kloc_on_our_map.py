@@ -88,7 +88,7 @@ def theirs(
     )
 
 
-def test_its_pairs_and_ours_agree(theirs: Theirs, fountain_workspace: Path) -> None:
+def test_pairs_of_both_agree(theirs: Theirs, fountain_workspace: Path) -> None:
     by_query: dict[str, list[str]] = {}
     for pair in read_pairs(theirs.query_pairs):
         by_query.setdefault(pair.query, []).append(pair.map)
@@ -98,17 +98,19 @@ def test_its_pairs_and_ours_agree(theirs: Theirs, fountain_workspace: Path) -> N
     assert by_query == ours
 
 
-def test_its_localizer_localizes_in_our_map(theirs: Theirs, fountain: Path, tmp_path: Path) -> None:
+def test_kapture_localization_localizes_in_our_map(
+    theirs: Theirs, fountain: Path, tmp_path: Path
+) -> None:
     result = tmp_path / "localized"
     places = ["-i", theirs.together, "--query", fountain / "query", "-o", result]
     kloc("kapture_pycolmap_localize", *places, "--pairsfile-path", theirs.query_pairs)
     assert_all_localized(result, fountain / "query_gt")
 
 
-def test_our_stages_run_on_its_pairs_and_matches(
+def test_our_stages_run_on_pairs_and_matches_of_kapture_localization(
     theirs: Theirs, fountain: Path, tmp_path: Path
 ) -> None:
-    # its matches are mutual nearest neighbours without any verification
+    # these matches are mutual nearest neighbours without verification
     places = [theirs.workspace, theirs.mapping_matches]
     mapping = KaptureFolder(fountain / "mapping", features_dirs=places)
     assert len(mapping.matches(LOCAL).pairs) == 21  # all pairs of 7 images

@@ -1,4 +1,4 @@
-"""A focal length that does not fit is noticed; one that is not known is estimated."""
+"""Wrong focal lengths are detected, unknown ones are estimated."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from poses import rigid
 
 from megloc_kapture.geometry.cameras import project, px_from_cam
 from megloc_kapture.io.images import guessed_camera
@@ -36,28 +36,30 @@ ALONE = RigidTransform.identity()
 OPTIONS = AbsolutePoseOptions()
 
 
-def misfit(
-    factor: float, *, outliers: int = 100, noise_px: float = 1.0, seed: int = 0
-) -> FocalMisfit | None:
-    """Of a facade with 4 m of relief, 10 m away; the given focal length is wrong by the factor."""
+def seen_by(
+    camera: Camera, *, seed: int = 0, noise_px: float = 1.0
+) -> tuple[Floats, Floats, RigidTransform]:
+    """Return pixels and points of a facade 10 m away, a quarter of them wrong, and the pose."""
     rng = np.random.default_rng(seed)
-    true = Camera.pinhole(1600, 1200, 1400.0)
-    quat = np.array([0.98, 0.05, 0.18, 0.02])
-    pose = RigidTransform(tuple((quat / np.linalg.norm(quat)).tolist()), (0.3, -0.2, 0.5))
+    pose = rigid(np.radians([5, 20, 2]), [0.3, -0.2, 0.5])
     points = rng.uniform((-5, -4, 8.0), (5, 4, 12.0), (400, 3))
-    pixels = project(true, pose, points) + rng.normal(0, noise_px, (400, 2))
-    pixels[:outliers] = rng.uniform((0, 0), (1600, 1200), (outliers, 2))
-    camera = Camera.pinhole(1600, 1200, 1400.0 * factor)
-    view = View(camera, ALONE, pixels, points)
+    pixels = project(camera, pose, points) + rng.normal(0, noise_px, (400, 2))
+    pixels[:100] = rng.uniform((0, 0), (camera.width, camera.height), (100, 2))
+    return pixels, points, pose
+
+
+def misfit(factor: float, *, noise_px: float = 1.0, seed: int = 0) -> FocalMisfit | None:
+    """Check a camera whose focal length is wrong by the factor."""
+    pixels, points, _ = seen_by(Camera.pinhole(1600, 1200, 1400.0), seed=seed, noise_px=noise_px)
+    view = View(Camera.pinhole(1600, 1200, 1400.0 * factor), ALONE, pixels, points)
     result = rig_pose([view])
     assert isinstance(result, Pose)
     return focal_misfit(PoseProblem.of([view]), result, OPTIONS)
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.8, 0.95, 1.05, 1.2, 1.5])
-@pytest.mark.parametrize("seed", range(1))
-def test_a_wrong_focal_length_is_estimated(factor: float, seed: int) -> None:
-    result = misfit(factor, seed=seed)
+@pytest.mark.parametrize("factor", [0.5, 0.95, 1.05, 1.5])
+def test_a_wrong_focal_length_is_detected(factor: float) -> None:
+    result = misfit(factor)
     assert result is not None
     numbers = re.fullmatch(
         r"the focal length of (\d+) px does not fit: (\d+) \+- (\d+) px would", result.remark
@@ -67,23 +69,20 @@ def test_a_wrong_focal_length_is_estimated(factor: float, seed: int) -> None:
     assert given == round(1400 * factor)
     assert better == pytest.approx(1400, rel=0.03)
     assert abs(better - 1400) <= 3 * deviation
-    # the camera is as much too near or too far, and 10 m away
+    # the camera is 10 m away: too near or too far by the same factor
     assert result.shift == pytest.approx(abs(factor - 1), rel=0.25, abs=0.02)
     results = [LocalizationResult(remarks=remarks) for remarks in (("no image", result.remark), ())]
-    assert misfits_text([results[0], *results], "status.csv") == (
-        "the given focal length does not fit in 2 queries: see the remarks in status.csv"
-    )
+    assert "in 2 queries" in misfits_text([results[0], *results], "status.csv")
 
 
-@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("noise_px", [0.3, 3.0])
-def test_a_right_one_is_left_alone(seed: int, noise_px: float) -> None:
-    assert misfit(1.0, seed=seed, noise_px=noise_px) is None
-    assert misfit(1.01, seed=seed, noise_px=noise_px) is None
+def test_a_right_focal_length_has_no_misfit(noise_px: float) -> None:
+    assert misfit(1.0, seed=0, noise_px=noise_px) is None
+    assert misfit(1.01, seed=1, noise_px=noise_px) is None
 
 
 def straight_on() -> tuple[Floats, Floats]:
-    """A wall, 10 m away, by a camera of 1400 px: pixels and points."""
+    """Return pixels and points of a wall 10 m away; the focal length is 1400 px."""
     rng = np.random.default_rng(0)
     points = np.c_[rng.uniform(-4, 4, (200, 2)), np.full(200, 10.0)]
     pixels = project(Camera.pinhole(1600, 1200, 1400.0), ALONE, points)
@@ -96,7 +95,7 @@ def test_no_misfit_of_a_wall_seen_straight_on() -> None:
     assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS) is None
 
 
-def test_few_inliers_and_rigs_say_nothing() -> None:
+def test_few_inliers_and_rigs_have_no_misfit() -> None:
     view = View(Camera.pinhole(64, 48, 50), ALONE, np.zeros((5, 2)), np.ones((5, 3)))
     pose = Pose(ALONE, 5, 5, np.ones(5, bool))
     assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS) is None
@@ -104,13 +103,13 @@ def test_few_inliers_and_rigs_say_nothing() -> None:
 
 
 def solved(camera: Camera, pixels: Floats, points: Floats) -> Pose | Failure:
-    """The pose by a camera that is not known for certain, with the camera."""
+    """Estimate pose and camera from an uncertain camera."""
     problem = PoseProblem.of([View(camera, ALONE, pixels, points)])
     problem, estimate = estimate_with_intrinsics(problem, OPTIONS)
     assert isinstance(estimate, PoseEstimate)
     problem, result = refine_with_intrinsics(problem, estimate, OPTIONS, camera)
     if isinstance(result, Pose) and result.camera:
-        # what is looked at afterwards is of the camera that the pose was found with
+        # the returned problem has the estimated camera
         assert problem.views[0].camera.params == result.camera.params
         assert result.inliers is not None
         errors, _ = match_errors(problem, result.cam_from_world)
@@ -118,19 +117,10 @@ def solved(camera: Camera, pixels: Floats, points: Floats) -> Pose | Failure:
     return result
 
 
-@pytest.mark.parametrize(
-    ("given_px", "deviation"), [(1400 * k, 0.1) for k in (0.7, 0.97, 1, 1.2)] + [(1920, 0.7)]
-)
-@pytest.mark.parametrize("seed", range(1))
-def test_an_uncertain_camera_is_estimated(given_px: float, deviation: float, seed: int) -> None:
-    """By a camera of 1400 px, off its middle and a little bent, given with another focal length."""
-    rng = np.random.default_rng(seed)
+@pytest.mark.parametrize(("given_px", "deviation"), [(980, 0.1), (1680, 0.1), (1920, 0.7)])
+def test_an_uncertain_camera_is_estimated(given_px: float, deviation: float) -> None:
     true = Camera("SIMPLE_RADIAL", 1600, 1200, (1400.0, 806.0, 595.0, -0.03))
-    rotation = Rotation.from_euler("xyz", [5, 20, 2], degrees=True).as_matrix()
-    pose = RigidTransform.from_matrix(rotation, np.array([0.3, -0.2, 0.5]))
-    points = rng.uniform((-5, -4, 8.0), (5, 4, 12.0), (400, 3))
-    pixels = project(true, pose, points) + rng.normal(0, 1, (400, 2))
-    pixels[:100] = rng.uniform((0, 0), (1600, 1200), (100, 2))
+    pixels, points, pose = seen_by(true)
     given = Camera("SIMPLE_RADIAL", 1600, 1200, (given_px, 800.0, 600.0, 0.0), deviation)
     result = solved(given, pixels, points)
     assert isinstance(result, Pose) and result.camera is not None
@@ -140,37 +130,24 @@ def test_an_uncertain_camera_is_estimated(given_px: float, deviation: float, see
     assert np.linalg.norm(result.cam_from_world.center() - pose.center()) < 0.06
 
 
-@pytest.mark.parametrize("exif_px", [350.0, 2600.0, 90000.0])
-def test_exif_of_another_lens_is_not_believed(exif_px: float) -> None:
+@pytest.mark.parametrize("exif_px", [350.0, 90000.0])
+def test_a_wrong_focal_length_of_exif_is_corrected(exif_px: float) -> None:
     pixels, points, pose = seen_by(Camera.pinhole(1600, 1200, 1400.0))
     given = replace(guessed_camera(1600, 1200), focal_deviation=0.1)
     result = solved(replace(given, params=(exif_px, *given.params[1:])), pixels, points)
     assert isinstance(result, Pose) and result.camera is not None
     assert result.camera.params[0] == pytest.approx(1400, rel=0.02)
     assert np.linalg.norm(result.cam_from_world.center() - pose.center()) < 0.1
-    # one that was estimated of several images is
+    # an estimate from several images is kept
     known = replace(given, params=(1500.0, *given.params[1:]), focal_deviation=0.005)
     result = solved(known, pixels, points)
     assert isinstance(result, Pose) and result.camera is not None
     assert result.camera.params[0] > 1430
 
 
-def seen_by(
-    camera: Camera, count: int = 400, seed: int = 0, noise_px: float = 1.0
-) -> tuple[Floats, Floats, RigidTransform]:
-    """Pixels and points of a facade, a quarter of them wrong, and the pose."""
-    rng = np.random.default_rng(seed)
-    turn = Rotation.from_euler("xyz", [5, 20, 2], degrees=True).as_matrix()
-    pose = RigidTransform.from_matrix(turn, np.array([0.3, -0.2, 0.5]))
-    points = rng.uniform((-5, -4, 8.0), (5, 4, 12.0), (count, 3))
-    pixels = project(camera, pose, points) + rng.normal(0, noise_px, (count, 2))
-    pixels[: count // 4] = rng.uniform((0, 0), (camera.width, camera.height), (count // 4, 2))
-    return pixels, points, pose
-
-
 @pytest.mark.parametrize("focal_px", [500.0, 5000.0])
 def test_very_short_and_very_long_lenses(focal_px: float) -> None:
-    """COLMAP's guess is 1920 px."""
+    """The guess is 1920 px."""
     rng = np.random.default_rng(1)
     true = Camera.pinhole(1600, 1200, focal_px)
     half = 600 / focal_px
@@ -203,19 +180,18 @@ def photograph(seed: int, focal: float, deviation: float) -> tuple[Pose, RigidTr
     """Return a pose with its estimate of the camera, and the true pose."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((-6, -4, 9), (6, 4, 12), (300, 3))
-    turn = Rotation.from_rotvec(rng.uniform(-0.05, 0.05, 3)).as_matrix()
-    true = RigidTransform.from_matrix(turn, rng.uniform(-0.5, 0.5, 3))
+    true = rigid(rng.uniform(-0.05, 0.05, 3), rng.uniform(-0.5, 0.5, 3))
     px = px_from_cam(TRUE, true.apply(points)) + rng.normal(0, 1.0, (300, 2))
     camera = replace(TRUE, params=(focal, 768.0, 512.0, 0.0), focal_deviation=deviation)
-    # nearer or farther by as much as the focal length is off
-    off = np.array(true.translation) + (0, 0, 10.5 * (focal / 1380 - 1))
-    pose = RigidTransform.from_matrix(turn, off)
+    # nearer or farther by the error of the focal length
+    away = 10.5 * (focal / 1380 - 1)
+    pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, away)) @ true
     return Pose(
         pose, 300, 300, camera=camera, inlier_points_px=px, inlier_points_world=points
     ), true
 
 
-def test_poses_come_nearer_to_the_truth() -> None:
+def test_a_shared_camera_improves_the_poses() -> None:
     estimates = ((1310.0, 0.05), (1372.0, 0.006), (1385.0, 0.006), (1420.0, 0.03), (1384.0, 0.005))
     alone = [photograph(seed, *estimate) for seed, estimate in enumerate(estimates)]
     solved = solve_with_shared_camera([pose for pose, _ in alone], OPTIONS)
@@ -226,7 +202,7 @@ def test_poses_come_nearer_to_the_truth() -> None:
     assert max(after) < 0.3 * max(before) and np.median(after) <= np.median(before)
     for pose in solved:
         assert pose.camera is not None and abs(pose.camera.params[0] / 1380 - 1) < 0.008
-        assert pose.remarks[-1].startswith("focal length estimated of 5 photographs")
+        assert "5 photographs" in pose.remarks[-1]
 
 
 def test_another_zoom_keeps_its_focal_length() -> None:
@@ -234,15 +210,11 @@ def test_another_zoom_keeps_its_focal_length() -> None:
     solved = solve_with_shared_camera(poses, OPTIONS)
     assert solved[2] is poses[2]
     assert solved[0].camera != poses[0].camera
+    for few in ([], poses[:1]):
+        assert solve_with_shared_camera(few, OPTIONS) == few
 
 
-@pytest.mark.parametrize("number", [0, 1])
-def test_one_has_nothing_to_share(number: int) -> None:
-    poses = [photograph(seed, 1350.0, 0.01)[0] for seed in range(number)]
-    assert solve_with_shared_camera(poses, OPTIONS) == poses
-
-
-def test_the_certain_estimates_count() -> None:
+def test_the_shared_camera_is_that_of_the_certain_estimates() -> None:
     cameras = [
         replace(TRUE, params=(f, 768.0, 512.0, 0.0), focal_deviation=d)
         for f, d in ((1200.0, 0.1), (1380.0, 0.004), (1381.0, 0.004), (1600.0, 0.1))

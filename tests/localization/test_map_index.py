@@ -70,15 +70,15 @@ def test_shared_points_equal_to_sets(rows: list[tuple[int, int, int]], asked: li
     assert shared.tolist() == [[len(mine & other) for other in points] for mine in points]
 
 
-def test_nothing_in_it_can_be_written_to() -> None:
+def test_the_index_is_read_only() -> None:
     xyz = np.zeros((3, 3))
     index = MapIndex.build(xyz, ("a",), *(np.zeros(1, np.int64),) * 3)
     for array in (index.xyz, index.offsets, index.keypoint_ids, index.point_ids):
         assert not array.flags.writeable
-    xyz[0] = 1.0  # whose array it is may go on writing
+    xyz[0] = 1.0  # the caller's array stays writable
 
 
-def test_an_observation_of_an_image_that_has_no_name() -> None:
+def test_observations_of_unknown_images_are_refused() -> None:
     with pytest.raises(ValueError):
         build([(1, 0, 0)], ("a",))
 
@@ -100,7 +100,7 @@ def triples(result: Correspondences) -> list[tuple[int, int, int]]:
 
 
 def greedy(matches: list[tuple[int, int, float, int]]) -> list[tuple[int, int, int]]:
-    """Matches of most images, then the most similar, each keypoint and each point once."""
+    """Take pairs by number of images, then similarity; each keypoint and point once."""
     support = Counter((k, p) for k, p, _, _ in matches)
     best: dict[tuple[int, int], float] = {}
     for k, p, similarity, _ in matches:
@@ -145,11 +145,11 @@ def test_matches_with_map_keypoints_that_observe_a_point() -> None:
     typed = TypedMatches(MAP, np.zeros((15, 2), np.float32), given)
     keypoint_ids, point_ids, similarities, image_rows = typed.observed
     assert keypoint_ids.tolist() == [10, 12, 13]
-    assert point_ids.tolist() == [0, 1, 2]  # the first of the two of keypoint 7
+    assert point_ids.tolist() == [0, 1, 2]  # keypoint 7 observes two points: the first counts
     assert similarities.tolist() == [0.9, 0.7, 0.5]
     assert image_rows.tolist() == [0, 0, 3]
     assert triples(typed.correspondences()) == [(10, 0, 1), (12, 1, 1), (13, 2, 1)]
-    # images that are left out have no say
+    # other images are ignored
     assert triples(typed.correspondences(["c", "e", "b"])) == [(13, 2, 1)]
     assert triples(typed.correspondences([])) == []
     none = [("a", np.zeros((0, 2), np.int64), np.zeros(0))]

@@ -1,10 +1,11 @@
-"""The ranker by pictures, in rooms that are alike but for what hangs on their walls."""
+"""Ranking by appearance, in rooms that differ by a poster on the wall."""
 
 from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 import pytest
@@ -35,17 +36,18 @@ def stripes(seed: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArra
 
 
 def colours(room: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A wall: what every room has, and a poster of its own."""
+    """Paint the wall that all rooms share, and the room's poster."""
     poster = (np.abs(x - 0.6) < 0.45) & (np.abs(y) < 0.6)
     value = np.where(poster, stripes(100 + room, x, y), stripes(0, x, y))
     return np.repeat((128 + 18 * value).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
 
 
 def standing(room: int, x: float = 0.0, z: float = 0.0) -> RigidTransform:
-    """Looking straight at the wall of a room."""
+    """Return the pose of a camera that faces the wall of a room."""
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (-(APART_M * room + x), 0.0, -z))
 
 
+@cache
 def photograph(room: int, pose: RigidTransform) -> NDArray[np.uint8]:
     columns, rows = np.meshgrid(np.arange(CAMERA.width) + 0.5, np.arange(CAMERA.height) + 0.5)
     rays = bearing_rays(CAMERA, np.stack([columns.ravel(), rows.ravel()], axis=1))
@@ -57,7 +59,7 @@ def photograph(room: int, pose: RigidTransform) -> NDArray[np.uint8]:
 
 @dataclass
 class Scene:
-    """Rooms with two map images each; some without depth, and from a column on without it."""
+    """Rooms with two map images each; some images lack depth, or depth in some columns."""
 
     query: NDArray[np.uint8]
     without_depth: tuple[str, ...] = ()
@@ -101,7 +103,7 @@ class Scene:
 
 
 def hypothesis(room: int, inliers: int, views: int = 1) -> PoseHypothesis:
-    """The query's pose as one room explains it, with so many inliers of what all rooms share."""
+    """Return the query's pose in a room, with inliers on the part that all rooms share."""
     rng = np.random.default_rng(0)
     pose = standing(room)
     points = rng.uniform((-1.5, -1.0, WALL_M), (0.1, 1.0, WALL_M + 1e-9), (300, 3))[:inliers]
@@ -153,16 +155,16 @@ def test_scores_follow_the_hypotheses(scene: Scene) -> None:
     np.testing.assert_allclose(ranker().score(HYPOTHESES[::-1], scene)[::-1], forward, atol=1e-6)
     few = ranker(finalists=2).score(HYPOTHESES, scene)
     assert np.argmax(few) == 2
-    # the others follow the finalists, ordered by their distances
+    # the others follow the finalists by their distances
     by_alone = ranker(finalists=1).score(HYPOTHESES, scene)
     np.testing.assert_array_equal(np.argsort(-few)[2:], np.argsort(-by_alone)[2:])
 
 
-def test_pictures_are_compared_where_both_rooms_show_something(scene: Scene) -> None:
-    # a wrong room of which only the part that all have in common is known: nothing against it
+def test_rooms_are_compared_on_their_common_pixels(scene: Scene) -> None:
+    # only the part that all rooms share is known of a wrong room
     narrow = PoseHypothesis(("0_0.jpg",), HYPOTHESES[0].views, 4.0)
     scene.unknown["0_0.jpg"] = slice(60, None)
-    # and noise on the query where the right room is known as well
+    # the query has noise on a part that is known of the right room
     noise = np.random.default_rng(0).normal(0, 12, scene.query.shape)
     scene.query = (scene.query + noise).clip(0, 255).astype(np.uint8)
     right = scene.query[:, 100:]
@@ -176,7 +178,7 @@ def test_pictures_are_compared_where_both_rooms_show_something(scene: Scene) -> 
 
 
 def test_rooms_without_common_pixels_compare_their_distances(scene: Scene) -> None:
-    # of the wrong room the poster is known, of the right one the wall next to it
+    # the poster of the wrong room and the wall of the right one are known
     for room, unknown in ((0, slice(90)), (RIGHT, slice(70, None))):
         scene.unknown |= {f"{room}_{number}.jpg": unknown for number in (0, 1)}
     for order in (1, -1):
@@ -188,16 +190,16 @@ def test_rooms_without_common_pixels_compare_their_distances(scene: Scene) -> No
 
 
 def test_poses_without_depth_or_pixels(scene: Scene) -> None:
-    # hopeless clusters are not looked at
+    # clusters with few inliers are skipped
     scores = ranker(min_inlier_share=0.5).score(HYPOTHESES, scene)
     assert np.argmin(scores) == 2  # 120 of 300
     assert not any(name.startswith("2_") for name in scene.asked)
-    # what has no depth stands last
+    # hypotheses without depth come last
     scene.without_depth = ("3_0.jpg", "3_1.jpg")
     scores = ranker().score(HYPOTHESES, scene)
     assert np.argmax(scores) == 2 and np.argmin(scores) == 3
     assert np.isfinite(scores).all()
-    # where it is the best by inliers, or the query is masked, inliers decide
+    # inliers decide if the best by inliers has no depth, or the query is masked
     expected = DistinctiveInliers().score(HYPOTHESES, scene)
     scene.without_depth = ("0_0.jpg", "0_1.jpg")
     np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
@@ -208,7 +210,7 @@ def test_poses_without_depth_or_pixels(scene: Scene) -> None:
 
 def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
     plain = ranker().score(HYPOTHESES, scene)
-    # a person before the right part of the view
+    # a person hides the right part of the view
     scene.query = scene.query.copy()
     scene.query[:, 125:] = 255 * (np.indices((CAMERA.height, 35)).sum(0) % 2)[..., None]
     spoilt = ranker().score(HYPOTHESES, scene)
@@ -243,8 +245,8 @@ def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
     assert not aligned_view(CAMERA, near, [], scene).valid.any()
 
 
-def test_repeated_photographs_wait_until_the_others_are_taken() -> None:
-    # one place was photographed again and again
+def test_references_from_different_positions_come_first() -> None:
+    # four images from nearly the same position, and another
     room = Scene(
         photograph(RIGHT, standing(RIGHT)),
         stands=lambda number: (0.9 if number == 9 else -0.5 + 0.001 * number, 0.5),
@@ -255,7 +257,7 @@ def test_repeated_photographs_wait_until_the_others_are_taken() -> None:
     assert room.asked == ["2_3.jpg", "2_9.jpg"]
     of_film = aligned_view(CAMERA, standing(RIGHT), film, room, two)
     assert view.valid.mean() > of_film.valid.mean() + 0.1
-    # with room for all, and without alternatives, all are taken in order
+    # all are used if the number allows
     room.asked = []
     aligned_view(CAMERA, standing(RIGHT), [*film, "2_9.jpg"], room)
     assert room.asked == ["2_3.jpg", "2_9.jpg", "2_2.jpg", "2_1.jpg", "2_0.jpg"]

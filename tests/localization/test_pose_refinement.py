@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import poselib
 import pytest
-from hypothesis import given, settings
+from camera_models import CAMERAS, CX, CY, PINHOLE, F
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from poses import located, random_pose
-from scipy.spatial.transform import Rotation
+from poses import error_vector, located, random_pose
 from scipy.stats import chi2
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px, project, px_from_cam
+from megloc_kapture.geometry.poses import perturbed
 from megloc_kapture.localization import absolute_pose as module
 from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
@@ -23,39 +24,25 @@ from megloc_kapture.localization.absolute_pose import (
     refine_pose,
 )
 from megloc_kapture.localization.map_index import PoseProblem, View
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 Array = NDArray[np.float64]
-F, CX, CY = 500.0, 321.0, 238.5
-PINHOLE = Camera("PINHOLE", 640, 480, (F, 510.0, CX, CY))
 AT_ORIGIN = RigidTransform.identity()
 LOOSE = AbsolutePoseOptions(max_error_px=100)
 
 
 @pytest.fixture
 def whole_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Points count by all of their covariance."""
+    """Weight points by their full covariance."""
     monkeypatch.setattr(module, "_MAP_NOISE", 1.0)
-
-
-def moved(pose: RigidTransform, vector: Array) -> RigidTransform:
-    """``exp(rotation, translation) pose``, to first order in the translation."""
-    turn = RigidTransform.from_matrix(Rotation.from_rotvec(vector[:3]).as_matrix(), vector[3:])
-    return turn @ pose
 
 
 def in_unit(pose: RigidTransform, unit: float) -> RigidTransform:
     return RigidTransform(pose.quat_wxyz, tuple(unit * np.array(pose.translation)))
 
 
-def error_vector(actual: RigidTransform, truth: RigidTransform) -> Array:
-    true_from_found = truth @ actual.inverse()
-    vector = Rotation.from_matrix(true_from_found.rotation_matrix()).as_rotvec()
-    return np.concatenate([vector, true_from_found.translation])
-
-
 def squared_error(pose: Pose, truth: RigidTransform) -> float:
-    """Over the pose's covariance."""
+    """Return the squared Mahalanobis distance by the pose's covariance."""
     assert pose.covariance is not None
     error = error_vector(pose.cam_from_world, truth)
     return float(error @ np.linalg.solve(pose.covariance, error))
@@ -67,7 +54,7 @@ def refined(
     options: AbsolutePoseOptions | None = None,
     usable: NDArray[np.bool_] | None = None,
 ) -> Pose | Failure:
-    """Refined from a start, all matches usable unless told otherwise."""
+    """Refine a start; ``usable`` None means all matches."""
     count = len(view.points_px)
     usable = np.ones(count, dtype=np.bool_) if usable is None else usable
     estimate = PoseEstimate(start, usable, usable, np.zeros(count))
@@ -75,12 +62,12 @@ def refined(
 
 
 def six(matrices: Array) -> Array:
-    """Symmetric (N, 3, 3) as (N, 6): xx, xy, xz, yy, yz, zz."""
+    """Return symmetric (N, 3, 3) as (N, 6): xx, xy, xz, yy, yz, zz."""
     return matrices[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
 
 def random_covariances(rng: np.random.Generator, count: int, size: float) -> Array:
-    """Anisotropic (N, 3, 3): each point has its own long axis, of about ``size``."""
+    """Return anisotropic (N, 3, 3) whose longest axes are about ``size``."""
     factors = rng.normal(size=(count, 3, 3)) * (size * np.array([1.0, 0.3, 0.1]))
     return factors @ factors.transpose(0, 2, 1)
 
@@ -94,16 +81,14 @@ def noisy_view(
 
 
 @pytest.mark.usefixtures("whole_covariance")
-@pytest.mark.parametrize("model", CAMERA_MODEL_NUM_PARAMS)
-def test_the_covariance_of_a_rig_is_by_finite_differences(
-    cameras: dict[str, Camera], model: str
-) -> None:
-    """Without covariances of the points; the scale comes from its residuals."""
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_the_covariance_of_a_rig_agrees_with_finite_differences(model: str) -> None:
+    """Points have no covariances; the scale comes from the residuals."""
     rng = np.random.default_rng(0)
     truth = random_pose(rng)
     views = []
-    for camera in (cameras[model], PINHOLE):
-        cam_from_rig = moved(AT_ORIGIN, np.append(rng.normal(size=3), 0.3 * rng.normal(size=3)))
+    for camera in (CAMERAS[model], PINHOLE):
+        cam_from_rig = perturbed(AT_ORIGIN, np.append(rng.normal(size=3), 0.3 * rng.normal(size=3)))
         seen = noisy_view(camera, cam_from_rig @ truth, rng, 20)
         views.append(replace(seen, cam_from_rig=cam_from_rig))
     all_matches = np.ones(40, np.bool_)
@@ -111,7 +96,7 @@ def test_the_covariance_of_a_rig_is_by_finite_differences(
     pose = located(refine_pose(PoseProblem.of(views), estimate, LOOSE))
 
     def residuals(vector: Array) -> Array:
-        rig_from_world = moved(pose.cam_from_world, vector)
+        rig_from_world = perturbed(pose.cam_from_world, vector)
         return np.concatenate(
             [
                 project(v.camera, v.cam_from_rig @ rig_from_world, v.points_world) - v.points_px
@@ -128,7 +113,7 @@ def test_the_covariance_of_a_rig_is_by_finite_differences(
 
 
 def refined_by_poselib(view: View, start: RigidTransform) -> RigidTransform:
-    """Two rounds of poselib's refinement with the same scale rule, on undistorted pixels."""
+    """Refine twice by poselib with our rule for the scale, on undistorted pixels."""
     focal = focal_px(view.camera)
     pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
     undistorted = np.ascontiguousarray(bearing_rays(view.camera, view.points_px)[:, :2]) * focal
@@ -148,16 +133,15 @@ def refined_by_poselib(view: View, start: RigidTransform) -> RigidTransform:
     return pose
 
 
-@pytest.mark.parametrize("sigma_px", [0.05, 1.0, 3.0])
-def test_without_covariances_it_is_poselibs_refinement(sigma_px: float) -> None:
-    """A pinhole camera: undistorted pixels are the pixels, but for the two focal lengths."""
+@pytest.mark.parametrize("sigma_px", [0.05, 3.0])
+def test_without_covariances_the_pose_equals_poselibs(sigma_px: float) -> None:
     rng = np.random.default_rng(1)
     square = replace(PINHOLE, params=(F, F, CX, CY))
-    for _ in range(20):
+    for _ in range(8):
         truth = random_pose(rng)
         view = noisy_view(square, truth, rng, 100, sigma_px)
         view.points_px[:10] += 8.0 * rng.normal(size=(10, 2))
-        start = moved(truth, 2e-3 * sigma_px * rng.normal(size=6))
+        start = perturbed(truth, 2e-3 * sigma_px * rng.normal(size=6))
         # in standard deviations of the pose
         off = squared_error(located(refined(view, start)), refined_by_poselib(view, start))
         assert np.sqrt(off) < 0.01
@@ -165,18 +149,15 @@ def test_without_covariances_it_is_poselibs_refinement(sigma_px: float) -> None:
 
 @pytest.mark.usefixtures("whole_covariance")
 @given(
-    st.sampled_from(sorted(CAMERA_MODEL_NUM_PARAMS)),
+    st.sampled_from(sorted(CAMERAS)),
     st.integers(0, 2**32 - 1),
     st.sampled_from([1e-3, 1, 1e3]),
 )
-@settings(max_examples=30, deadline=None)
-def test_the_minimum_is_found_from_nearby_under_any_model(
-    cameras: dict[str, Camera], model: str, seed: int, unit: float
-) -> None:
+def test_refinement_converges_under_any_model(model: str, seed: int, unit: float) -> None:
     rng = np.random.default_rng(seed)
     truth = random_pose(rng)
-    view = noisy_view(cameras[model], truth, rng, 40, 0.0)
-    start = moved(truth, 0.01 * rng.normal(size=6))
+    view = noisy_view(CAMERAS[model], truth, rng, 40, 0.0)
+    start = perturbed(truth, 0.01 * rng.normal(size=6))
     scaled = replace(view, points_world=unit * view.points_world)
     pose = located(refined(scaled, in_unit(start, unit), LOOSE))
     apart = error_vector(pose.cam_from_world, in_unit(truth, unit))
@@ -185,9 +166,8 @@ def test_the_minimum_is_found_from_nearby_under_any_model(
 
 
 @pytest.mark.usefixtures("whole_covariance")
-@pytest.mark.parametrize("sigma_px", [0.4, 2.0])
-@pytest.mark.parametrize("size", [1e-9, 0.02])
-def test_the_covariance_is_that_of_repeated_estimates(size: float, sigma_px: float) -> None:
+@pytest.mark.parametrize(("size", "sigma_px"), [(1e-9, 0.4), (0.02, 2.0)])
+def test_the_covariance_predicts_the_spread_of_estimates(size: float, sigma_px: float) -> None:
     """Errors over their covariance follow chi-squared with six degrees of freedom."""
     rng = np.random.default_rng(2)
     truth = random_pose(rng)
@@ -206,7 +186,7 @@ def test_the_covariance_is_that_of_repeated_estimates(size: float, sigma_px: flo
 
 
 def test_points_count_by_the_noise_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half the noise in the map is a quarter of the covariances; none makes the points exact."""
+    """Half the map noise scales covariances by a quarter; zero makes the points exact."""
     rng = np.random.default_rng(8)
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 60)
@@ -220,7 +200,7 @@ def test_points_count_by_the_noise_of_the_map(monkeypatch: pytest.MonkeyPatch) -
     quarter = replace(view, point_covariances=covariances / 4)
     assert pose(known, 0.5) == pose(quarter, 1.0) != pose(known, 1.0)
     assert pose(known, 0.0) == pose(view, 1.0)
-    # also in one call
+    # absolute_pose passes covariances on
     given = view.points_px, view.points_world, PINHOLE
     plain, weighted = (
         located(absolute_pose(*given, point_covariances=weighted_view)).cam_from_world
@@ -229,7 +209,7 @@ def test_points_count_by_the_noise_of_the_map(monkeypatch: pytest.MonkeyPatch) -
     assert plain != weighted
 
 
-def test_an_unknown_covariance_counts_as_none() -> None:
+def test_an_unknown_covariance_means_an_exact_point() -> None:
     rng = np.random.default_rng(5)
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 60)
@@ -274,8 +254,8 @@ def test_unusable_matches_are_ignored() -> None:
     assert first.inliers is not None and not first.inliers[:20].any()
 
 
-def test_an_unstable_pose_is_a_failure_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All points within some millimetres of a line: the camera may nearly turn about it."""
+def test_an_unstable_pose_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All points lie within millimetres of a line: the camera can nearly rotate about it."""
     rng = np.random.default_rng(8)
     truth = random_pose(rng)
     along = rng.uniform(-2, 2, (30, 1)) * np.array([0.8, 0.3, 0.5])
@@ -285,12 +265,12 @@ def test_an_unstable_pose_is_a_failure_that_says_so(monkeypatch: pytest.MonkeyPa
     view = View(PINHOLE, AT_ORIGIN, pixels, world)
     result = refined(view, truth)
     assert isinstance(result, Failure)
-    assert result.reason.startswith("the pose is unstable: its centre's standard deviation is ")
+    assert "unstable" in result.reason
     assert result.num_matches == result.num_inliers == 30
     monkeypatch.setattr(module, "_MAX_CENTER_DEVIATION", 1e9)
     pose = located(refined(view, truth))
     assert pose.covariance is not None
-    # the criterion: the centre's deviation over the median depth, whatever the unit
+    # the criterion: the centre's deviation over the median depth, in any unit
     deviation = np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])
     depth = np.median(pose.cam_from_world.apply(world)[:, 2])
     for unit in (1.0, 1e-3, 1e3):
@@ -300,12 +280,12 @@ def test_an_unstable_pose_is_a_failure_that_says_so(monkeypatch: pytest.MonkeyPa
             assert bool(refined(scaled, in_unit(truth, unit))) == stable
 
 
-def test_too_few_inliers_after_refinement_say_so() -> None:
+def test_too_few_inliers_after_refinement_are_a_failure() -> None:
     rng = np.random.default_rng(9)
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 20)
     view.points_px[:9] += 30.0
     result = refined(view, truth)
     assert isinstance(result, Failure)
-    assert result.reason == "11 of 20 2D-3D matches agree, at least 12 are needed"
+    assert "11 of 20 2D-3D matches agree" in result.reason
     assert (result.num_matches, result.num_inliers) == (20, 11)

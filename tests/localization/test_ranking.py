@@ -1,4 +1,4 @@
-"""Rankers of candidate poses, on hypotheses whose right order is known."""
+"""Rankers of poses by their inliers, on hypotheses whose right order is known."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_ERROR_PX = 5.0
 
 
 class NoScene:
-    """Our rankers look at matches only."""
+    """Refuse everything: rankers by inliers use matches only."""
 
     def __getattr__(self, name: str) -> object:
         raise AssertionError(f"{name} was asked for")
@@ -57,13 +57,13 @@ def test_inliers_are_counted_over_all_views() -> None:
 
 
 def room(count: int, seed: int = 0) -> NDArray[np.float64]:
-    """Points in front of a camera at the origin."""
+    """Return points in front of a camera at the origin."""
     rng = np.random.default_rng(seed)
     return rng.uniform((-1.5, -1.0, 3.0), (1.5, 1.0, 5.0), (count, 3))
 
 
 def standing(at_x: float, points: NDArray[np.float64]) -> PoseHypothesis:
-    """Somebody in the room at ``at_x`` sees points given in that room's frame."""
+    """Return a hypothesis in the room at ``at_x`` that sees points of the room's frame."""
     pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (-at_x, 0.0, 0.0))
     world = points + (at_x, 0.0, 0.0)
     seen = view(project(CAMERA, pose, world), np.zeros(len(points)), pose, world)
@@ -88,8 +88,8 @@ def test_distinctive_inliers_beat_more_common_ones() -> None:
 
 def test_a_place_counts_where_it_has_an_inlier_nearby() -> None:
     walls = room(50)
-    beside = walls + (0.01, 0.0, 0.0)  # 1 to 2 px
-    hypotheses = [standing(0.0, walls), standing(7.0, beside)]
+    nearby = walls + (0.01, 0.0, 0.0)  # 1 to 2 px
+    hypotheses = [standing(0.0, walls), standing(7.0, nearby)]
     exact = ranker(radius=0.0, power=1.0).score(hypotheses, NoScene())
     near = ranker(radius=0.01, power=1.0).score(hypotheses, NoScene())
     np.testing.assert_allclose(exact, 50.0)

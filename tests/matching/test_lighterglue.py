@@ -1,4 +1,4 @@
-"""LighterGlue with its published weights: kornia's own matches, and a real scene."""
+"""LighterGlue with its published weights on a real scene, and mismatched weights."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def fountain(shared_data: Path) -> KaptureFolder:
 
 @pytest.fixture(scope="module")
 def features(shared_data: Path, fountain: KaptureFolder) -> dict[str, ImageFeatures]:
-    """XFeat's of two neighbouring images."""
+    """Extract XFeat from two neighbouring images."""
     weights = str(shared_data / "weights" / "xfeat" / "xfeat.pt")
     extractor = XFeat(XFeatOptions(weights=weights, max_keypoints=1000, device="cpu"))
     result = {}

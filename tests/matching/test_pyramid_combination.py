@@ -1,4 +1,4 @@
-"""Keypoints that grow, and the matches of a pair put together with those of its variants."""
+"""Unions of keypoints, and matches of a pair combined with those of its variants."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def nearest(keypoint: np.ndarray, among: np.ndarray) -> int:
 
 
 @given(base=POSITIONS, more=POSITIONS)
-def test_against_looking_at_all_of_them(
+def test_the_union_equals_a_search_of_all_keypoints(
     base: list[tuple[float, float]], more: list[tuple[float, float]]
 ) -> None:
     union = KeypointUnion(array(base))
     kept = array(base)
     for keypoint in array(more):
-        expected = nearest(keypoint, kept[: len(base)])  # those that were there come first
+        expected = nearest(keypoint, kept[: len(base)])  # the base comes first
         if expected < 0:
             behind = nearest(keypoint, kept[len(base) :])
             expected = behind if behind < 0 else behind + len(base)
@@ -56,7 +56,7 @@ def test_against_looking_at_all_of_them(
 
 
 @given(base=POSITIONS, more=POSITIONS, taken_back=st.integers(0, 25))
-def test_truncated_keypoints_are_gone(
+def test_truncation_removes_keypoints(
     base: list[tuple[float, float]], more: list[tuple[float, float]], taken_back: int
 ) -> None:
     union = KeypointUnion(array(base))
@@ -83,7 +83,7 @@ def variant_matches(
 
 
 def grid(count: int) -> np.ndarray:
-    """Keypoints ten pixels apart."""
+    """Return keypoints ten pixels apart."""
     return np.stack([np.arange(count) * 10.0, np.zeros(count)], axis=1).astype(np.float32)
 
 
@@ -93,9 +93,9 @@ BASE = (np.array([[0, 0], [1, 1]]), np.array([0.9, 0.8]))
 def test_mode_all_adds_new_matches() -> None:
     keypoints = KeypointUnion(grid(5))
     tried = [
-        # at keypoint 2; new; new, but the other one has a match; at keypoint 1, which has one
+        # at keypoint 2; new; new, but its partner is matched; at keypoint 1, which is matched
         variant_matches([(20.5, 0.5), (5, 5), (6, 50), (10, 0)], [7, 8, 0, 9], [0.1, 0.2, 1, 1]),
-        variant_matches([(5, 5.9)], [10]),  # the poorer one's keypoint is the other's: has a match
+        variant_matches([(5, 5.9)], [10]),  # its keypoint equals (5, 5), which is matched
     ]
     combined = combine(BASE, [(0, each) for each in tried], "all", (keypoints, None))
     assert combined.matches.tolist() == [[0, 0], [1, 1], [5, 8], [2, 7]]
@@ -109,12 +109,12 @@ def test_variants_of_both_images_add_to_both() -> None:
     first, second = KeypointUnion(grid(3)), KeypointUnion(grid(4))
     tried = [(0, variant_matches([(5, 5)], [3])), (1, variant_matches([(6, 6), (7, 60)], [2, 1]))]
     combined = combine(BASE, tried, "all", (first, second))
-    # the richer one first; row 1 of the first image has a match
+    # the variant with more matches comes first; row 1 of the first image is matched
     assert combined.matches.tolist() == [[0, 0], [1, 1], [2, 4], [3, 3]]
     assert combined.added[0].tolist() == [[0, 0]] and combined.added[1].tolist() == [[1, 0]]
 
 
-def test_max_is_the_richest() -> None:
+def test_mode_max_takes_the_variant_with_most_matches() -> None:
     rich = variant_matches([(5, 5), (0, 0.5), (15, 5)], [0, 5, 6])
     richer = variant_matches([(5, 45), (10, 40), (15, 45), (20, 40)], [0, 5, 6, 7])
     keypoints = KeypointUnion(grid(5))
@@ -125,9 +125,9 @@ def test_max_is_the_richest() -> None:
     assert combined.matches.tolist() == [[5, 0], [0, 5], [6, 6]]
 
 
-def test_max_keeps_the_images_as_they_are_where_no_variant_has_more() -> None:
+def test_mode_max_keeps_the_base_unless_a_variant_has_more() -> None:
     keypoints = KeypointUnion(grid(5))
-    # as many matches; three, but two of their keypoints are one
+    # as many matches; three matches, two of which share a keypoint
     some = variant_matches([(5, 5), (15, 5)], [4, 5])
     seemingly = variant_matches([(5, 5), (5, 5.5), (15, 5)], [4, 5, 6])
     for tried in ([], [(0, some)], [(0, seemingly)]):

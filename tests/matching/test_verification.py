@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
+from camera_models import STRONG
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from poses import rigid
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays, project, px_from_cam
 from megloc_kapture.matching.verification import (
@@ -34,35 +35,30 @@ DISTORTED = [
 ]
 
 
-def pose(rotation_vector: list[float], translation: list[float]) -> RigidTransform:
-    rotation = Rotation.from_rotvec(rotation_vector).as_matrix()
-    return RigidTransform.from_matrix(rotation, np.array(translation))
-
-
-def plain(rays: Array, focal_px: float) -> tuple[Array, Array]:
-    """Rays, and their slopes in a camera without distortion."""
+def undistorted(rays: Array, focal_px: float) -> tuple[Array, Array]:
+    """Return rays and their slopes in a camera without distortion."""
     return rays, np.repeat(np.eye(2)[None] / focal_px, len(rays), axis=0)
 
 
 def seen(camera: Camera, pixels: Array) -> tuple[Array, Array]:
-    """Rays and slopes of pixels."""
+    """Return rays and slopes of pixels."""
     rays = bearing_rays(camera, pixels)
     return rays, ray_slopes(camera, pixels, rays)
 
 
-# what the old measure, normalised coordinates times the focal length, got wrong
+# normalised coordinates times the focal length differ a lot from pixels
 WIDE = [
     Camera("OPENCV_FISHEYE", 900, 900, (280.0, 280.0, 450.0, 450.0, 0.02, -0.005, 0.0, 0.0)),
     Camera("OPENCV", 900, 700, (350.0, 340.0, 450.0, 350.0, -0.25, 0.08, 2e-3, -1e-3)),
 ]
 
-B_FROM_A = pose([0.02, -0.15, 0.05], [-1.0, 0.1, 0.2])
+B_FROM_A = rigid([0.02, -0.15, 0.05], [-1.0, 0.1, 0.2])
 
 
 def scene(
     camera_a: Camera, camera_b: Camera, count: int = 200, seed: int = 0
 ) -> tuple[Array, Array, Array]:
-    """Points (N, 3) in a's frame that both cameras see, and their pixels in both."""
+    """Return points (N, 3) in a's frame that both cameras see, and their pixels in both."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((-3, -2, 4), (3, 2, 9), (8 * count, 3))
     in_a = project(camera_a, RigidTransform.identity(), points)
@@ -86,7 +82,7 @@ def test_essential_matrix_is_colmaps() -> None:
 
 
 def test_the_sampson_distance_is_colmaps() -> None:
-    """Of cameras without distortion and of one focal length; in normalised coordinates."""
+    """Both cameras have the same focal length and no distortion."""
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=(50, 2)), rng.normal(size=(50, 2))
     expected = pycolmap.compute_squared_sampson_error(a, b, essential_matrix(B_FROM_A))
@@ -111,7 +107,7 @@ def test_slopes_are_the_derivative_of_the_ray_by_the_pixel(camera: Camera) -> No
 def smallest_correction_px(
     camera_a: Camera, px_a: Array, camera_b: Camera, px_b: Array, start: Array
 ) -> float:
-    """How far two measurements have to move until one point explains them; by least squares."""
+    """Return by least squares the smallest correction of two measurements of a point."""
 
     def residuals(point: Array) -> Array:
         in_a = project(camera_a, RigidTransform.identity(), point[None])[0]
@@ -122,8 +118,9 @@ def smallest_correction_px(
     return float(np.linalg.norm(result.fun))
 
 
-@pytest.mark.parametrize("camera_b", [PINHOLE, DISTORTED[1], WIDE[0]], ids=lambda c: c.model)
-@pytest.mark.parametrize("camera_a", WIDE, ids=lambda c: c.model)
+@pytest.mark.parametrize(
+    ("camera_a", "camera_b"), [(WIDE[0], PINHOLE), (WIDE[1], WIDE[0])], ids=["pinhole", "fisheye"]
+)
 def test_the_error_is_that_of_optimal_triangulation_to_first_order(
     camera_a: Camera, camera_b: Camera
 ) -> None:
@@ -139,13 +136,13 @@ def test_the_error_is_that_of_optimal_triangulation_to_first_order(
     np.testing.assert_allclose(ours, expected, rtol=0.01, atol=0.01)
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED, *WIDE], ids=lambda c: c.model)
+@pytest.mark.parametrize("camera", [PINHOLE, DISTORTED[0], WIDE[0]], ids=lambda c: c.model)
 def test_exact_matches_pass_and_others_do_not(camera: Camera) -> None:
     points, in_a, in_b = scene(camera, camera)
     matches = (*seen(camera, in_a), *seen(camera, in_b))
     assert verify_with_poses(*matches, B_FROM_A).all()
     # the same matches under another pose do not
-    wrong = pose([0.02, -0.05, 0.05], [-1.0, 0.9, 0.2])
+    wrong = rigid([0.02, -0.05, 0.05], [-1.0, 0.9, 0.2])
     assert not verify_with_poses(*matches, wrong, KnownPoseOptions(max_error_px=2.0)).any()
 
 
@@ -157,7 +154,7 @@ def test_points_behind_a_camera_do_not_pass() -> None:
     in_b_frame = B_FROM_A.apply(behind)
     rays_b = np.column_stack([in_b_frame[:, :2] / in_b_frame[:, 2:], np.ones(100)])
     # all of them lie on their epipolar lines exactly
-    matches = (*plain(rays_a, 500.0), *plain(rays_b, 500.0))
+    matches = (*undistorted(rays_a, 500.0), *undistorted(rays_b, 500.0))
     assert sampson_error_px(*matches, B_FROM_A).max() < 1e-9
     expected = (behind[:, 2] > 0) & (in_b_frame[:, 2] > 0)
     np.testing.assert_array_equal(in_front_of_both(rays_a, rays_b, B_FROM_A), expected)
@@ -169,14 +166,13 @@ def test_points_behind_a_camera_do_not_pass() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(deadline=None)
 def test_in_front_agrees_with_the_sign_of_both_depths(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    b_from_a = pose((0.5 * rng.normal(size=3)).tolist(), rng.normal(size=3).tolist())
+    b_from_a = rigid(0.5 * rng.normal(size=3), rng.normal(size=3))
     points = 5 * rng.normal(size=(40, 3))
     in_b = b_from_a.apply(points)
     clear = (np.abs(points[:, 2]) > 0.1) & (np.abs(in_b[:, 2]) > 0.1)
-    # rays that are nearly parallel say nothing about depth
+    # nearly parallel rays do not determine a depth
     a = points / np.linalg.norm(points, axis=1, keepdims=True)
     b = (in_b / np.linalg.norm(in_b, axis=1, keepdims=True)) @ b_from_a.rotation_matrix()
     clear &= np.linalg.norm(np.cross(a, b), axis=1) > 1e-3
@@ -187,13 +183,12 @@ def test_in_front_agrees_with_the_sign_of_both_depths(seed: int) -> None:
     )
 
 
-def test_cameras_at_one_place_verify_nothing() -> None:
-    # no baseline: no epipolar line, and nothing that could be triangulated
+def test_cameras_without_a_baseline_verify_nothing() -> None:
     rays = bearing_rays(PINHOLE, np.random.default_rng(0).uniform(0, 480, (50, 2)))
-    turned = pose([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+    turned = rigid([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
     moved = rays @ turned.rotation_matrix().T
-    good = verify_with_poses(*plain(rays, 500.0), *plain(moved / moved[:, 2:], 500.0), turned)
-    assert not good.any()
+    others = undistorted(moved / moved[:, 2:], 500.0)
+    assert not verify_with_poses(*undistorted(rays, 500.0), *others, turned).any()
 
 
 def test_too_few_good_matches_are_rejected() -> None:
@@ -203,20 +198,21 @@ def test_too_few_good_matches_are_rejected() -> None:
     for min_matches, expected in ((10, 10), (11, 0)):
         good = verify_with_poses(*matches, B_FROM_A, min_matches=min_matches)
         assert good.sum() == expected
-    none = plain(np.zeros((0, 3)), 515.0)
+    none = undistorted(np.zeros((0, 3)), 515.0)
     assert verify_with_poses(*none, *none, B_FROM_A).shape == (0,)
 
 
-def test_rays_that_do_not_exist_do_not_pass() -> None:
-    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
-    points, in_a, in_b = scene(strong, PINHOLE, count=40)
-    in_a[3] = 0.0  # in the corner, where nothing is seen
-    good = verify_with_poses(*seen(strong, in_a), *seen(PINHOLE, in_b), B_FROM_A)
-    assert not good[3] and good.sum() == 39
+def test_pixels_without_rays_do_not_pass() -> None:
+    points, in_a, in_b = scene(STRONG, PINHOLE, count=100)
+    in_a[3], in_a[99] = (0.0, 0.0), (640.0, 480.0)
+    good = verify_with_poses(*seen(STRONG, in_a), *seen(PINHOLE, in_b), B_FROM_A)
+    assert not good[3] and good.sum() == 98
+    good = verify_two_view(in_a, STRONG, in_b, PINHOLE)
+    assert not good[3] and not good[99] and good.sum() > 93
 
 
 def test_fisheye_pixels_without_a_forward_ray_are_refused() -> None:
-    """Such a pixel has no ray (x, y, 1); COLMAP gives one, of another pixel."""
+    """Such a pixel has no ray (x, y, 1), but COLMAP returns a ray of another pixel."""
     camera = WIDE[0]
     radius = np.linspace(1.0, 630.0, 300)
     pixels = 450.0 + np.stack([radius, radius], axis=1) * np.sqrt(0.5)
@@ -233,7 +229,7 @@ def test_fisheye_pixels_without_a_forward_ray_are_refused() -> None:
     assert np.isnan(slopes[outside]).all()
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED], ids=lambda c: c.model)
+@pytest.mark.parametrize("camera", [PINHOLE, DISTORTED[2]], ids=lambda c: c.model)
 def test_two_views_keep_the_inliers_among_as_many_outliers(camera: Camera) -> None:
     rng = np.random.default_rng(0)
     _, in_a, in_b = scene(camera, PINHOLE, count=300)
@@ -262,30 +258,18 @@ def test_two_views_of_a_plane() -> None:
     assert verify_two_view(in_a, PINHOLE, in_b, PINHOLE).mean() > 0.95
 
 
-def test_two_views_leave_out_pixels_whose_distortion_cannot_be_undone() -> None:
-    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
-    corner = np.array([[0.0, 0.0], [640.0, 480.0]])
-    assert np.isnan(bearing_rays(strong, corner)).any(axis=1).all()
-    points, in_a, in_b = scene(strong, PINHOLE, count=100)
-    in_a = np.concatenate([corner[:1], in_a, corner[1:]])
-    in_b = np.concatenate([in_b[:1], in_b, in_b[-1:]])
-    good = verify_two_view(in_a, strong, in_b, PINHOLE)
-    assert not good[0] and not good[-1]
-    assert good[1:-1].mean() > 0.95
-
-
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-OPTIONS = TwoViewOptions(max_iterations=5000)  # of matches in no order
+OPTIONS = TwoViewOptions(max_iterations=5000)
 
 
 def verified(first: Array, second: Array) -> tuple[Array, Camera, Array, Camera, int]:
-    """Return the inliers of RANSAC as arguments of ``agree_by_chance``."""
+    """Return the inliers of RANSAC, as arguments of ``agree_by_chance``."""
     kept = verify_two_view(first, CAMERA, second, CAMERA, OPTIONS)
     return first[kept], CAMERA, second[kept], CAMERA, len(first)
 
 
 def of_one_scene(number: int, share: float, seed: int) -> tuple[Array, Array]:
-    """Matches of which a share is of one scene, the others of anything."""
+    """Return matches; a share of them is of the same scene, the others are random."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (number, 3))
     first, second = px_from_cam(CAMERA, points), px_from_cam(CAMERA, points - (0.6, 0.1, 0.2))
@@ -294,26 +278,23 @@ def of_one_scene(number: int, share: float, seed: int) -> tuple[Array, Array]:
     return first, second
 
 
-@pytest.mark.parametrize("number", [40, 150, 600, 2000])
+@pytest.mark.parametrize("number", [40, 600])
 def test_random_matches_agree_by_chance(number: int) -> None:
-    for seed in range(2):
-        result = verified(*of_one_scene(number, 0.0, seed))
-        assert agree_by_chance(*result, OPTIONS), len(result[0])
+    result = verified(*of_one_scene(number, 0.0, seed=0))
+    assert agree_by_chance(*result, OPTIONS), len(result[0])
 
 
-@pytest.mark.parametrize(("number", "share"), [(40, 0.8), (150, 0.4), (600, 0.2), (2000, 0.15)])
-def test_true_ones_do_not(number: int, share: float) -> None:
+@pytest.mark.parametrize(("number", "share"), [(40, 0.8), (600, 0.2)])
+def test_matches_of_a_scene_do_not_agree_by_chance(number: int, share: float) -> None:
     result = verified(*of_one_scene(number, share, seed=1))
     assert not agree_by_chance(*result, OPTIONS), len(result[0])
     first, _, second, *_ = result
-    assert agree_by_chance(first[:5], CAMERA, second[:5], CAMERA, 5, OPTIONS)  # a bare sample
+    assert agree_by_chance(first[:5], CAMERA, second[:5], CAMERA, 5, OPTIONS)  # a minimal sample
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_wrong_matches_along_a_shelf(seed: int) -> None:
-    """Keypoints in one band: most wrong matches are near the line of a camera that moved along
-    it, more than of an image full of keypoints, and still they say nothing."""
-    rng = np.random.default_rng(seed)
+def test_random_matches_in_a_band_agree_by_chance() -> None:
+    """Most wrong matches are near the epipolar line of a camera that moves along the band."""
+    rng = np.random.default_rng(0)
     first, second = (
         np.column_stack([rng.uniform(0, 640, 200), 240 + rng.normal(0, 4, 200)]) for _ in range(2)
     )

@@ -1,4 +1,4 @@
-"""Points whose values are what a query shows, and scenes in memory."""
+"""Points with the values that a query has there, and scenes in memory."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 import pytest
+from camera_models import CAMERAS
 from numpy.typing import NDArray
 from poses import random_pose
 
@@ -18,17 +19,6 @@ from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]
-F, CX, CY = 500.0, 321.0, 238.5
-PARAMS = {
-    "SIMPLE_PINHOLE": (F, CX, CY),
-    "PINHOLE": (F, 510.0, CX, CY),
-    "SIMPLE_RADIAL": (F, CX, CY, -0.05),
-    "OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3),
-    "OPENCV_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 3e-3, -1e-3),
-    "FOV": (F, 510.0, CX, CY, 0.9),
-    "THIN_PRISM_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 1e-3, -1e-3, 1e-3, 0.0, 1e-3, -1e-3),
-}
-CAMERAS = {model: Camera(model, 640, 480, params) for model, params in PARAMS.items()}
 WIDTH, HEIGHT = 160, 120
 
 
@@ -55,20 +45,20 @@ def made_problem(
     wrong: float = 0.0,
     seed: int = 0,
 ) -> tuple[LevelProblem, RigidTransform]:
-    """Points whose values are what the query shows at the true pose, up to gain and bias."""
+    """Make points with the query's values at the true pose, up to gain and bias."""
     rng = np.random.default_rng(seed)
     camera, pose = CAMERAS[model], random_pose(rng)
     image = texture(rng, channels)
     px = rng.uniform((20, 20), (camera.width - 20, camera.height - 20), (count, 2))
     points = pose.inverse().apply(bearing_rays(camera, px) * rng.uniform(2.0, 9.0, (count, 1)))
     scale = WIDTH / camera.width
-    # as float32, as the level has it
+    # float32 like the level
     values = bilinear(image.astype(np.float32).astype(float), *(scale * px.T - 0.5))
     groups = rng.integers(0, 2, count)
     values = np.array([0.7, 1.3])[groups, None] * values + np.array([0.2, -0.4])[groups, None]
     outliers = rng.random(count) < wrong
     values[outliers] += rng.normal(size=(outliers.sum(), channels)) * 3
-    # a level's noise is blurred as the level is
+    # a level's noise is blurred like the level
     query = (image + noise * texture(rng, channels, 0.8)).astype(np.float32)
     level = Level(query, np.ones((HEIGHT, WIDTH), bool), scale, scale)
     chosen = ChosenPoints(points, values, groups)
@@ -77,7 +67,7 @@ def made_problem(
 
 @dataclass
 class Scene:
-    """A map and its queries by image; what is not given is not there."""
+    """A map and its queries by image name."""
 
     poses: dict[str, RigidTransform]
     cameras: dict[str, Camera]
@@ -114,11 +104,11 @@ class Scene:
 
 @pytest.fixture(scope="session")
 def new_scene() -> Callable[..., Scene]:
-    """Makes scenes; no pixels are needed by what looks at depth alone."""
+    """Return a builder of scenes."""
     return Scene
 
 
 @pytest.fixture(scope="session")
 def problem() -> Callable[..., tuple[LevelProblem, RigidTransform]]:
-    """Makes problems and their true poses."""
+    """Return a builder of problems with their true poses."""
     return made_problem

@@ -1,4 +1,4 @@
-"""Neural fields of a ray-cast room, whose light, movers, depth and poses are known."""
+"""Neural fields of a ray-cast room with known light, moving objects, depth and poses."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def train_field(
 
 @pytest.fixture(autouse=True, scope="module")
 def one_thread() -> Iterator[None]:
-    """The same bytes need it, and so does a machine that does other things as well."""
+    """Train with a single thread: equal bytes need it."""
     with single_threaded():
         yield
 
 
 @pytest.fixture(autouse=True)
 def coarse_planes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Quick tests have planes of a hundredth of the size: most of a step is their optimizer's."""
+    """Reduce the planes in quick tests to a hundredth: the optimizer takes most of a step."""
     if request.node.get_closest_marker("slow") is None:
         monkeypatch.setattr(radiance, "_RESOLUTIONS", (16, 32, 48))
 
@@ -63,7 +63,7 @@ def views(
     for number, pose in enumerate(room.poses(count, seed)):
         mover = number if moving and number % 5 < 3 else None
         seen = room.render(pose, camera=camera, light=number % 2, moving=mover)
-        # of the room alone, as stereo or a scan made at another time has it
+        # depth of the empty room, as if measured at another time
         alone = room.render(pose, camera=camera).depth_m
         known = DepthView(camera, alone, IDENTITY) if depth else None
         result.append(FieldView(f"{number:03}.png", seen.image, camera, pose, None, known))
@@ -71,7 +71,7 @@ def views(
 
 
 def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
-    """Median share by which rendered depths are off."""
+    """Return the median relative error of rendered depths."""
     errors = []
     for view in tests:
         assert view.depth is not None
@@ -81,7 +81,7 @@ def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
     return float(np.median(errors))
 
 
-def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
+def test_a_small_field_learns_the_room_deterministically() -> None:
     seen: list[tuple[int, list[float]]] = []
     options = FieldTrainingOptions(steps=60, rays_per_step=256, device="cpu")
 
@@ -95,10 +95,10 @@ def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     assert [step for step, _ in seen] == list(range(12, 60, 12))
     assert all(len(values) == 1 for _, values in seen)
     brief = QUICK.model_copy(update={"steps": 3})
-    one, other = (train_field(views(5), brief)[0].module.state_dict() for _ in range(2))
-    assert all(torch.equal(one[name], other[name]) for name in one)
+    first, second = (train_field(views(5), brief)[0].module.state_dict() for _ in range(2))
+    assert all(torch.equal(first[name], second[name]) for name in first)
     changed, _ = train_field(views(5), brief.model_copy(update={"seed": 1}))
-    assert not torch.equal(changed.module.state_dict()["planes.0"], one["planes.0"])
+    assert not torch.equal(changed.module.state_dict()["planes.0"], first["planes.0"])
 
 
 def test_half_precision_learns_nearly_the_same() -> None:
@@ -130,14 +130,14 @@ with _compiling():
 
 
 @pytest.mark.slow
-def test_no_compiler_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_compiler_is_an_option_error(tmp_path: Path) -> None:
     environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path), "CXX": "/nowhere/g++"}
     command = [sys.executable, "-c", _COMPILE]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert re.search("OptionError: compiled: .*No working C.. compiler.*$", done.stderr)
 
 
-def test_interrupted_and_resumed_is_uninterrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resumed_training_equals_uninterrupted_training(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(field_training, "_KEEP_EVERY", 3)
     path, states = Path("field.state.pt"), list[bytes]()
     whole, _ = FieldTrainer(views(5), QUICK).train(keep=states.append)
@@ -168,7 +168,7 @@ def test_images_of_a_folder_may_share_their_light() -> None:
     assert light_rows(["b/1", "a/1", "b/2", "c"], "folder") == [0, 1, 0, 2]
 
 
-def test_masked_pixels_change_nothing() -> None:
+def test_masked_pixels_are_ignored() -> None:
     plain = views(4)
     mask = np.ones((24, 32), bool)
     mask[:, :10] = False
@@ -179,15 +179,15 @@ def test_masked_pixels_change_nothing() -> None:
         arguments = (view.camera, view.cam_from_world, mask, view.depth)
         masked.append(FieldView(view.name, view.image, *arguments))
         spoiled.append(FieldView(view.name, image, *arguments))
-    one, other, whole = (
+    first, second, whole = (
         train_field(given, QUICK.model_copy(update={"steps": 2}))[0].module.state_dict()
         for given in (masked, spoiled, plain)
     )
-    assert all(torch.equal(one[name], other[name]) for name in one)
-    assert not torch.equal(one["planes.0"], whole["planes.0"])
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["planes.0"], whole["planes.0"])
 
 
-def test_depth_of_another_camera_is_brought_to_the_image() -> None:
+def test_depth_of_another_camera_is_transformed() -> None:
     plain = views(4)
     finer = Camera("PINHOLE", 64, 48, (44.0, 44.0, 32.0, 24.0))
     shift = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.03, 0.0, 0.0))
@@ -209,15 +209,13 @@ def test_depth_of_another_camera_is_brought_to_the_image() -> None:
 
 def test_invalid_training_is_refused() -> None:
     few = views(1)
-    with pytest.raises(DataError, match="1 images with poses and pixels are too few"):
+    with pytest.raises(DataError, match="too few"):
         train_field(few, QUICK)
-    one = few[0]
-    wrong = FieldView(one.name, one.image[:-1], one.camera, one.cam_from_world)
+    (view,) = few
+    wrong = FieldView(view.name, view.image[:-1], view.camera, view.cam_from_world)
     with pytest.raises(DataError, match=r"000\.png: \(23, 32, 3\) does not fit .* 32x24"):
         train_field([wrong, wrong], QUICK)
-    hidden = FieldView(
-        one.name, one.image, one.camera, one.cam_from_world, np.zeros((24, 32), bool)
-    )
+    hidden = replace(view, mask=np.zeros((24, 32), bool))
     with pytest.raises(DataError, match="no pixel"):
         train_field([hidden, hidden], QUICK)
     field, _ = train_field(views(4, depth=False), QUICK.model_copy(update={"steps": 1}))

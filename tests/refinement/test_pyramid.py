@@ -1,11 +1,11 @@
-"""Points of depth maps and their visibility; pyramids: scales, masks, and changes of light."""
+"""Image pyramids, and the points of depth maps and their visibility."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from poses import rigid
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
@@ -25,9 +25,7 @@ APPEARANCES: tuple[Appearance, ...] = ("normalised", "colours")
 CAMERA = Camera("SIMPLE_RADIAL", 320, 240, (250.0, 161.0, 118.5, -0.05))
 DEPTH_CAMERA = Camera("PINHOLE", 160, 120, (130.0, 131.0, 80.0, 60.5))
 HERE = RigidTransform.identity()
-POSE = RigidTransform.from_matrix(
-    Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([1.0, 2.0, -0.5])
-)
+POSE = rigid([0.3, -0.2, 0.5], [1.0, 2.0, -0.5])
 
 
 def picture(seed: int = 0, width: int = 200, height: int = 150) -> NDArray[np.uint8]:
@@ -37,7 +35,7 @@ def picture(seed: int = 0, width: int = 200, height: int = 150) -> NDArray[np.ui
 
 
 @pytest.mark.parametrize("appearance", APPEARANCES)
-def test_levels_halve_and_know_their_scale(appearance: Appearance) -> None:
+def test_levels_have_half_the_size(appearance: Appearance) -> None:
     levels = build_pyramid(picture(), levels=3, max_side_px=100, appearance=appearance)
     channels = 3 if appearance == "colours" else 1
     sizes = [(75, 100), (37, 50), (18, 25)]
@@ -45,11 +43,11 @@ def test_levels_halve_and_know_their_scale(appearance: Appearance) -> None:
     assert [level.scale_x for level in levels] == [0.5, 0.25, 0.125]
     assert levels[1].scale_y == 37 / 150
     assert all(level.values.dtype == np.float32 for level in levels)
-    assert len(build_pyramid(picture(), levels=9)) == 4  # none is smaller than 16 px
+    assert len(build_pyramid(picture(), levels=9)) == 4  # at least 16 px
 
 
 @pytest.mark.parametrize("appearance", APPEARANCES)
-def test_masked_pixels_enter_no_value(appearance: Appearance) -> None:
+def test_masked_pixels_are_ignored(appearance: Appearance) -> None:
     mask = np.ones((150, 200), bool)
     mask[30:90, 50:120] = False
     images = [picture(), picture()]
@@ -109,10 +107,8 @@ def test_points_project_to_their_pixels() -> None:
     np.testing.assert_array_equal(lifted.px % 1.0, 0.5)
 
 
-def test_another_depth_camera_is_honoured() -> None:
-    image_from_depth = RigidTransform.from_matrix(
-        Rotation.from_rotvec([0.0, 0.05, 0.0]).as_matrix(), np.array([0.1, -0.02, 0.03])
-    )
+def test_depth_of_another_camera_is_transformed() -> None:
+    image_from_depth = rigid([0.0, 0.05, 0.0], [0.1, -0.02, 0.03])
     # of the plane z = 3 + 0.1 x
     x = (np.arange(160) + 0.5 - 80.0) / 130.0
     plane = np.broadcast_to(3.0 / (1 - 0.1 * x), (120, 160)).astype(np.float32)
@@ -129,11 +125,11 @@ def test_edges_and_unknown_depths_give_no_points() -> None:
     depth[:, 80:] = 2.0
     depth[50, 30], depth[60, 30], depth[70, 30], depth[80, 30] = 0.0, np.nan, -1.0, np.inf
     lifted = lift_points(DEPTH_CAMERA, HERE, DepthView(DEPTH_CAMERA, depth, HERE))
-    there = np.zeros((120, 160), bool)
-    there[tuple((lifted.px[:, ::-1] - 0.5).astype(int).T)] = True
-    assert not there[:, 79:81].any() and there[10, 77] and there[10, 82]
+    known = np.zeros((120, 160), bool)
+    known[tuple((lifted.px[:, ::-1] - 0.5).astype(int).T)] = True
+    assert not known[:, 79:81].any() and known[10, 77] and known[10, 82]
     for row in (50, 60, 70, 80):
-        assert not there[row, 30] and there[row + 3, 30]
+        assert not known[row, 30] and known[row + 3, 30]
 
 
 def test_near_surfaces_hide_far_ones() -> None:
@@ -149,10 +145,10 @@ def test_near_surfaces_hide_far_ones() -> None:
     assert not seen.seen[0][inside].any() and seen.seen[0][outside].all()
     alone = visibility([near], CAMERA, HERE).covered
     assert 0.08 < alone.mean() < 0.16
-    # from behind, nothing is in front of the camera
+    # a camera that looks back sees nothing
     turned = RigidTransform((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
     assert not visibility([far, near], CAMERA, turned).covered.any()
-    # cells are usable whose middle is valid
+    # cells with a valid middle are usable
     valid = np.ones((240, 320), bool)
     valid[:, :100] = False
     usable = usable_cells(valid, (60, 80))

@@ -1,20 +1,18 @@
-"""References are kept by their content; a map's own images, held out, in a corner of a room."""
+"""References, and the consistency of a map by its held-out images in a corner of a room."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from corner import pose_at, wall_texture
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from poses import displaced
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
@@ -45,7 +43,6 @@ Verdict = Callable[[Map], Consistency]
 CAMERA = Camera("PINHOLE", 160, 120, (130.0, 131.3, 80.0, 60.0))
 PX_PER_M = 60
 SLOW = pytest.mark.slow
-# two threads on small images wait for each other most of the time
 QUICK = RenderingOptions(max_references=3)
 # origin, unit vectors of the texture's columns and rows, metres along them
 WALLS = (
@@ -63,23 +60,13 @@ def reference(seed: int) -> RenderingReference:
 
 
 def test_an_image_must_fit_its_camera() -> None:
-    one = reference(0)
+    image = reference(0)
     with pytest.raises(DataError, match="does not fit a camera"):
-        pyramid_of(replace(one, image=one.image[:50]), RenderingOptions())
-
-
-@cache
-def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
-    rng = np.random.default_rng(seed)
-    image = np.zeros((height, width, 3))
-    for sigma in (1.5, 4.0, 12.0):
-        layer = cv2.GaussianBlur(rng.normal(size=(height, width, 3)), (0, 0), sigma)
-        image += layer / layer.std()
-    return np.clip(128 + 30 * image, 0, 255).astype(np.uint8)
+        pyramid_of(replace(image, image=image.image[:50]), RenderingOptions())
 
 
 def view(cam_from_world: RigidTransform, camera: Camera) -> RenderingReference:
-    """Render the corner: every ray meets the nearest wall."""
+    """Render the nearest wall of every ray."""
     h, w = camera.height, camera.width
     px = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), axis=-1).reshape(-1, 2)
     rays = bearing_rays(camera, px)
@@ -93,7 +80,7 @@ def view(cam_from_world: RigidTransform, camera: Camera) -> RenderingReference:
         on = cam_from_world.center() + far[:, None] * directions - origin
         # OpenCV's pixel centres are at integers
         x, y = ((on @ axis * PX_PER_M - 0.5).astype(np.float32) for axis in (across, down))
-        painted = texture(width * PX_PER_M, height * PX_PER_M, seed)
+        painted = wall_texture(width * PX_PER_M, height * PX_PER_M, seed)
         inside = (x >= 0) & (x < painted.shape[1]) & (y >= 0) & (y < painted.shape[0])
         nearest = inside & (far > 0) & (far < depth)
         seen = cv2.remap(painted, x.reshape(h, w), y.reshape(h, w), cv2.INTER_LINEAR)
@@ -106,18 +93,13 @@ def view(cam_from_world: RigidTransform, camera: Camera) -> RenderingReference:
     )
 
 
-def pose(center: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> RigidTransform:
-    rotation = Rotation.from_euler("xy", [pitch_deg, yaw_deg], degrees=True).as_matrix()
-    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
-
-
 POSES = [
-    pose((-1.5, 0.0, 0.0), -4, 3),
-    pose((-0.9, 0.3, 0.6), -2, 4),
-    pose((-0.2, -0.3, 0.1), 0, 6),
-    pose((0.4, 0.2, 0.9), 3, 2),
-    pose((1.0, -0.1, 0.2), 8, 5),
-    pose((-0.6, -0.5, -0.8), -6, 8),
+    pose_at((-1.5, 0.0, 0.0), -4, 3),
+    pose_at((-0.9, 0.3, 0.6), -2, 4),
+    pose_at((-0.2, -0.3, 0.1), 0, 6),
+    pose_at((0.4, 0.2, 0.9), 3, 2),
+    pose_at((1.0, -0.1, 0.2), 8, 5),
+    pose_at((-0.6, -0.5, -0.8), -6, 8),
 ]
 
 
@@ -131,7 +113,7 @@ def corner() -> Map:
 
 
 def scene_of(images: Map, new_scene: Callable[..., Any]) -> Any:
-    """A map of images in memory; nothing of queries."""
+    """Return a map of images in memory."""
     return new_scene(
         {name: each.cam_from_world for name, each in images.items()},
         {name: each.camera for name, each in images.items()},
@@ -142,7 +124,7 @@ def scene_of(images: Map, new_scene: Callable[..., Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def verdict(new_scene: Callable[..., Any]) -> Verdict:
-    """Judges a map by its images."""
+    """Return a function that judges a map by its images."""
 
     def judge(images: Map) -> Consistency:
         rendering, scene = Rendering(QUICK), scene_of(images, new_scene)
@@ -161,7 +143,7 @@ def exact(corner: Map, verdict: Verdict) -> Consistency:
 
 
 def changed(images: Map, change: Callable[[int, RenderingReference], dict[str, Any]]) -> Map:
-    """Every image with the fields that ``change`` gives for its number."""
+    """Replace fields of every image; ``change`` gets its number."""
     return {n: replace(each, **change(k, each)) for k, (n, each) in enumerate(images.items())}
 
 
@@ -170,7 +152,7 @@ def posed(images: Map, change: Callable[[int, RigidTransform], RigidTransform]) 
 
 
 def with_depth(images: Map, change: Callable[[DepthView], dict[str, Any]]) -> Map:
-    """Every image with these fields of its depth changed."""
+    """Replace fields of every image's depth."""
     return changed(images, lambda _, each: {"depth": replace(each.depth, **change(each.depth))})
 
 
@@ -179,15 +161,13 @@ def test_an_exact_map_is_consistent(exact: Consistency) -> None:
     assert exact.median.moved_m < 0.005 and exact.median.turned_deg < 0.08
 
 
-def test_poses_that_are_off_contradict_each_other(corner: Map, verdict: Verdict) -> None:
+def test_wrong_poses_contradict_each_other(corner: Map, verdict: Verdict) -> None:
     result = verdict(posed(corner, lambda k, each: displaced(each, k, 0.02, 0.5)))
     assert "contradicts itself" in result.reason
     assert result.median.moved_m > 0.01 and result.median.turned_deg > 0.25
 
 
-def test_depth_that_is_shifted_against_colour_shows_between_views(
-    corner: Map, verdict: Verdict
-) -> None:
+def test_shifted_depth_contradicts_other_views(corner: Map, verdict: Verdict) -> None:
     shifted = with_depth(corner, lambda view: {"depth_m": np.roll(view.depth_m, 7, axis=1)})
     assert "contradicts itself" in verdict(shifted).reason
 
@@ -197,7 +177,7 @@ def test_depth_that_is_shifted_against_colour_shows_between_views(
 def test_neither_unit_nor_frame_matters(
     corner: Map, verdict: Verdict, scale: float, off_deg: float
 ) -> None:
-    elsewhere = pose((30.0, -20.0, 5.0), 40, 20)
+    elsewhere = pose_at((30.0, -20.0, 5.0), 40, 20)
 
     def change(k: int, each: RigidTransform) -> RigidTransform:
         moved = displaced(each, k, 0.0, off_deg) @ elsewhere
@@ -211,12 +191,12 @@ def test_neither_unit_nor_frame_matters(
 
 
 @SLOW
-def test_images_that_share_a_displacement_do_not_vouch_for_each_other(verdict: Verdict) -> None:
+def test_images_with_a_shared_displacement_do_not_confirm_each_other(verdict: Verdict) -> None:
     # two scans of three views each, a centimetre apart
     centers = [(-0.6, 0.0, 0.0), (0.4, 0.1, 0.2)]
     scans = {
         f"{scan}-{k}.png": view(
-            pose((x + 0.01 * k, y, z), (0.0, -5.0, 5.0)[k], (4.0, 3.0, 6.0)[k]), CAMERA
+            pose_at((x + 0.01 * k, y, z), (0.0, -5.0, 5.0)[k], (4.0, 3.0, 6.0)[k]), CAMERA
         )
         for scan, (x, y, z) in enumerate(centers)
         for k in range(3)
@@ -227,7 +207,7 @@ def test_images_that_share_a_displacement_do_not_vouch_for_each_other(verdict: V
     assert "6 of 6" in verdict(off).reason
 
 
-def test_images_that_say_nothing_of_each_other(corner: Map, verdict: Verdict) -> None:
+def test_images_without_parallax_or_depth_are_not_judged(corner: Map, verdict: Verdict) -> None:
     # of one position
     rotations = [each.rotation_matrix() for each in POSES]
     center = POSES[2].center()
@@ -243,14 +223,14 @@ def test_images_that_say_nothing_of_each_other(corner: Map, verdict: Verdict) ->
 
 
 def test_images_behind_a_wall_are_no_reference(corner: Map, new_scene: Callable[..., Any]) -> None:
-    # two rooms back to back: what looks the same way from behind the wall sees nothing of it
+    # two rooms back to back: cameras behind the wall do not see it
     behind = {
         f"behind-{k}.png": view(
             RigidTransform.from_matrix(np.eye(3), -np.array([0.3 * k, 0.0, -0.5])), CAMERA
         )
         for k in range(3)
     }
-    # the same pictures and depths, said to be 6 m further on
+    # the same images and depths, 6 m farther on
     onwards = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -6.0))
     shifted = posed(behind, lambda _, each: onwards @ each)
     scene = scene_of({"0.png": corner["0.png"], **shifted}, new_scene)
@@ -270,14 +250,14 @@ def test_most_of_the_images_decide(wrong: list[bool]) -> None:
     assert result.median.squared_distance == pytest.approx(np.median(values))
 
 
-def test_few_images_decide_nothing_and_no_more_are_asked_for_than_needed() -> None:
+def test_few_images_decide_nothing_and_many_are_not_used() -> None:
     few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
     assert "unknown" in few.reason and few.images == MIN_TESTED - 1
     assert judge_consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
     asked = iter([known(1.0)] * 100)
     assert judge_consistency(asked).images == MAX_TESTED
     assert len(list(asked)) == 100 - MAX_TESTED
-    # what alignment does not resolve contradicts nothing
+    # displacements below the resolution of the alignment do not contradict
     assert known(1e4, 0.06).contradicts and not known(1e4, 0.04).contradicts
     assert not known(CHI2_OF_CHANCE, 100.0).contradicts
     assert Rendering().require_consistent_map

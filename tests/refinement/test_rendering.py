@@ -18,7 +18,6 @@ from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
 from megloc_twins.viewpoints import overlap
 from numpy.typing import NDArray
 from poses import displaced, pose_errors
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
@@ -29,7 +28,7 @@ from megloc_kapture.refinement.rendering import (
     _Refining,
     refine_by_rendering,
 )
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
 
 OPTIONS = SyntheticWorldOptions(
     num_places=1, day_queries=1, night_queries=1, width=400, height=300, supersampling=1
@@ -55,7 +54,7 @@ def painter(world: SyntheticWorld) -> PlaceRenderer:
 
 
 def darkened(look: Lighting) -> Lighting:
-    """The same scene as a camera of the night sees it: a fifth of the light, its colours, noise."""
+    """Return the lighting of a night camera: a fifth of the light, other colours, noise."""
     red, green, blue = look.white_balance
     return replace(
         look,
@@ -98,19 +97,19 @@ def run(case: Case, start: RigidTransform, **options: object) -> PoseRefinement:
     return refine_by_rendering(case.query, case.references, start, chosen)
 
 
-def assert_found(refined: PoseRefinement, truth: RigidTransform, m: float, deg: float) -> None:
+def assert_accurate(refined: PoseRefinement, truth: RigidTransform, m: float, deg: float) -> None:
     assert refined.accepted, refined.reason
     off_m, off_deg = pose_errors(refined.cam_from_world, truth)
     assert off_m < m and off_deg < deg
 
 
 def showing(case: Case, image: NDArray[np.uint8], **other: object) -> Case:
-    """The case with another picture of the query."""
+    """Return the case with another image of the query."""
     return replace(case, query=replace(case.query, image=image, **other))
 
 
 def occluded(image: NDArray[np.uint8], seed: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The image with something in front of 30 % of it, and where it is not."""
+    """Cover 30 % of the image; return it and the mask of the rest."""
     height, width = image.shape[:2]
     free = np.ones((height, width), bool)
     free[int(0.2 * height) : int(0.9 * height), int(0.3 * width) : int(0.73 * width)] = False
@@ -121,11 +120,10 @@ def occluded(image: NDArray[np.uint8], seed: int) -> tuple[NDArray[np.uint8], ND
     return np.where(free[..., None], image, cloth), free
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_gain_colour_and_noise_of_the_night_do_not_matter(case: Case, seed: int) -> None:
-    start = displaced(case.truth, seed)
+def test_a_pose_is_refined_despite_gain_colour_and_noise_of_the_night(case: Case) -> None:
+    start = displaced(case.truth, 0)
     refined = run(case, start)
-    assert_found(refined, case.truth, 0.005, 0.1)
+    assert_accurate(refined, case.truth, 0.005, 0.1)
     assert refined.measures["cost_after"] < refined.measures["cost_before"]
     assert refined.measures["moved_m"] == pytest.approx(
         pose_errors(refined.cam_from_world, start)[0]
@@ -136,38 +134,27 @@ def test_gain_colour_and_noise_of_the_night_do_not_matter(case: Case, seed: int)
     # 22.5 is the 99.9 % quantile of six degrees of freedom; it is an estimate, so twice that
     assert vector @ np.linalg.solve(covariance, vector) < 45
     assert np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) < 0.02
-    if seed == 0:  # the same twice
-        again = run(case, start)
-        assert (again.cam_from_world, again.measures) == (refined.cam_from_world, refined.measures)
-        assert again.covariance is not None and again.covariance.tobytes() == covariance.tobytes()
+    again = run(case, start)
+    assert (again.cam_from_world, again.measures) == (refined.cam_from_world, refined.measures)
 
 
-def test_lamps_instead_of_the_sun_still_let_it_improve(
-    world: SyntheticWorld, painter: PlaceRenderer
-) -> None:
+def test_a_pose_is_refined_under_lamps(world: SyntheticWorld, painter: PlaceRenderer) -> None:
     query = next(shot for shot in world.queries if shot.condition == "night")
     near = [reference(s, painter.render(s, depth=True)) for s in neighbours(world, query, 4)]
     night = RenderingQuery(painter.render(query).image, query.camera)
     truth = query.cam_from_world
-    assert_found(
-        refine_by_rendering(night, near, displaced(truth, 3, m=0.05, deg=1.0)), truth, 0.05, 0.25
-    )
+    refined = refine_by_rendering(night, near, displaced(truth, 3, m=0.05, deg=1.0))
+    assert_accurate(refined, truth, 0.05, 0.25)
 
 
-def test_the_truth_stays(case: Case) -> None:
+def test_the_true_pose_is_kept(case: Case) -> None:
     image, _ = occluded(case.query.image, 0)
     for seen in (case, showing(case, image)):
         refined = run(seen, case.truth)
         assert not refined.accepted and refined.cam_from_world is case.truth
-        # what was found is near it, but no nearer than images can tell
+        # the new pose is near, but the improvement is not significant
         assert 0 < refined.measures["moved_m"] < 0.015
         assert refined.measures["cost_after"] < refined.measures["cost_before"]
-
-
-def test_a_good_start_becomes_better(case: Case) -> None:
-    refined = run(case, displaced(case.truth, 0, m=0.01, deg=0.1))
-    assert_found(refined, case.truth, 0.008, 0.08)
-    assert refined.measures["significance"] >= RenderingOptions().min_significance
 
 
 def test_a_good_start_behind_a_moving_object_never_becomes_worse(case: Case) -> None:
@@ -175,13 +162,13 @@ def test_a_good_start_behind_a_moving_object_never_becomes_worse(case: Case) -> 
     image, _ = occluded(case.query.image, 0)
     hidden = showing(case, image)
     refined = run(hidden, start)
-    # it may stay; with no rule to keep it, it is better
+    # it may be kept; without that rule it improves
     free = run(hidden, start, min_significance=0.0)
     assert refined.cam_from_world in (start, free.cam_from_world)
-    assert_found(free, case.truth, 0.02, 0.2)
+    assert_accurate(free, case.truth, 0.02, 0.2)
 
 
-def test_a_search_that_leads_astray_does_not_spoil_a_good_start(
+def test_a_wrong_search_does_not_spoil_a_good_start(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     away = displaced(case.truth, 3, m=0.1, deg=3.0)
@@ -191,20 +178,15 @@ def test_a_search_that_leads_astray_does_not_spoil_a_good_start(
         lambda self, coarsest, start, sight: self._align(0, away, sight),
     )
     refined = run(case, displaced(case.truth, 4, m=0.01, deg=0.1))
-    assert_found(refined, case.truth, 0.008, 0.08)
+    assert_accurate(refined, case.truth, 0.008, 0.08)
 
 
 def test_a_masked_object_changes_nothing(case: Case) -> None:
     start = displaced(case.truth, 1)
-    result = []
-    for seed in (0, 1):
-        image, free = occluded(case.query.image, seed)
-        result.append(run(showing(case, image, mask=free), start))
-    result.append(run(showing(case, case.query.image, mask=free), start))
-    first, *others = result
-    assert first.accepted and pose_errors(first.cam_from_world, case.truth)[0] < 0.01
-    for other in others:
-        assert (other.cam_from_world, other.measures) == (first.cam_from_world, first.measures)
+    covered, free = occluded(case.query.image, 0)
+    result, same = (run(showing(case, i, mask=free), start) for i in (covered, case.query.image))
+    assert result.accepted and pose_errors(result.cam_from_world, case.truth)[0] < 0.01
+    assert (result.cam_from_world, result.measures) == (same.cam_from_world, same.measures)
 
 
 def test_masked_pixels_of_references_change_nothing(case: Case) -> None:
@@ -219,21 +201,21 @@ def test_masked_pixels_of_references_change_nothing(case: Case) -> None:
     assert result[0].cam_from_world == result[1].cam_from_world
 
 
-def test_a_hopeless_start_keeps_its_pose(case: Case) -> None:
+def test_a_start_far_off_is_kept(case: Case) -> None:
     start = displaced(case.truth, 0, m=1.5, deg=25.0)
     refined = run(case, start, min_overlap=0.0)
     assert not refined.accepted and refined.reason
     assert refined.cam_from_world is start and refined.covariance is None
 
 
-def test_each_bound_keeps_the_old_pose(case: Case) -> None:
+def test_poses_beyond_a_bound_are_rejected(case: Case) -> None:
     case = replace(case, references=case.references[:2])
     start = displaced(case.truth, 0)
     for options, reason in (
         ({"max_translation_m": 0.05}, "would move"),
         ({"max_rotation_deg": 1.0}, "would turn"),
         ({"min_correlation": 0.99}, "correlation"),
-        ({"min_significance": 20.0}, "cost improves"),
+        ({"min_significance": 20.0}, "standard errors"),
         ({"min_overlap": 1.0}, "cover"),
     ):
         refined = run(case, start, **options)
@@ -242,28 +224,6 @@ def test_each_bound_keeps_the_old_pose(case: Case) -> None:
     assert refined.accepted and refined.cam_from_world != start
     away = RigidTransform((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0)) @ case.truth  # looks back
     assert "cover" in run(case, away).reason
-
-
-def test_a_separate_depth_camera_is_used(
-    case: Case, painter: PlaceRenderer, shots: tuple[Frame, list[Frame]]
-) -> None:
-    depth_camera = Camera("PINHOLE", 320, 240, (220.0, 221.0, 160.5, 119.0))
-    depth_from_image = RigidTransform.from_matrix(
-        Rotation.from_rotvec([0.0, 0.03, 0.01]).as_matrix(), np.array([0.15, 0.02, 0.0])
-    )
-    references, careless = [], []
-    for shot, each in zip(shots[1], case.references, strict=True):
-        pose = depth_from_image @ shot.cam_from_world
-        beside = replace(shot, camera=depth_camera, cam_from_world=pose, bonnet=False)
-        depth_m = painter.render(beside, depth=True).depth_m
-        view = DepthView(depth_camera, depth_m, depth_from_image.inverse())
-        references.append(replace(each, depth=view))
-        careless.append(replace(each, depth=replace(view, image_from_depth=HERE)))
-    start = displaced(case.truth, 5)
-    refined = run(replace(case, references=tuple(references)), start)
-    assert_found(refined, case.truth, 0.01, 0.2)
-    wrong = run(replace(case, references=tuple(careless)), start)
-    assert not wrong.accepted or pose_errors(wrong.cam_from_world, case.truth)[0] > 0.03
 
 
 def test_the_plugin_takes_the_first_references_that_have_depth(

@@ -1,4 +1,4 @@
-"""A scene as COLMAP has it: images, a database of its features, and its model of them."""
+"""A scene in COLMAP's form: images, a database of features, and a model."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def write_workspace(
     Parameters
     ----------
     extractor : features instead of COLMAP's SIFT, which its wheels cannot extract.
-    kind : their pycolmap.FeatureExtractorType.
+    kind : the pycolmap.FeatureExtractorType of these features.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def write_workspace(
 def _write_features(
     root: Path, names: list[str], known: Any, extractor: LocalFeatureExtractor, kind: Any
 ) -> None:
-    """Features and their mutual matches as COLMAP has them; COLMAP verifies these."""
+    """Write features and mutual matches to the database, and let COLMAP verify the matches."""
     database = pycolmap.Database.open(root / "database.db")
     camera = pycolmap.Camera(
         model=known.model, width=known.width, height=known.height, params=known.params

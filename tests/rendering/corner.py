@@ -1,4 +1,4 @@
-"""A corner of a room, rendered exactly: two textured walls, from wherever a camera stands."""
+"""Exact images and depth of a corner of a room: two textured walls."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ IDENTITY = RigidTransform.identity()
 
 
 @cache
-def _texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
+def wall_texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
     rng = np.random.default_rng(seed)
     image = np.zeros((height, width, 3))
     for sigma in (1.5, 4.0, 12.0):
@@ -35,7 +35,7 @@ def _texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
 
 
 def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
-    """The image (H, W, 3) that the camera sees; exact but for bilinear sampling."""
+    """Render an image (H, W, 3), exact except for bilinear sampling."""
     fx, fy, cx, cy = CAMERA.params
     # OpenCV's warp has pixel centres at integers, in the texture and in the image
     calibration = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
@@ -43,7 +43,7 @@ def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
     size = (CAMERA.width, CAMERA.height)
     image = np.full((CAMERA.height, CAMERA.width, 3), 128, dtype=np.uint8)
     for seed, (origin, along, width, height) in enumerate(WALLS):
-        texture = _texture(width * TEXTURE_PX_PER_M, height * TEXTURE_PX_PER_M, seed)
+        texture = wall_texture(width * TEXTURE_PX_PER_M, height * TEXTURE_PX_PER_M, seed)
         world_from_texture = np.column_stack(
             [along / TEXTURE_PX_PER_M, [0, 1 / TEXTURE_PX_PER_M, 0], origin]
         )
@@ -57,7 +57,7 @@ def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
 
 
 def depth_m(cam_from_world: RigidTransform) -> NDArray[np.float32]:
-    """The depth (H, W) along the optical axis that the camera sees, metres; 0 beyond the walls."""
+    """Render the depth (H, W) along the optical axis in metres; 0 outside the walls."""
     fx, fy, cx, cy = CAMERA.params
     x = (np.arange(CAMERA.width) + 0.5 - cx) / fx
     y = (np.arange(CAMERA.height) + 0.5 - cy) / fy

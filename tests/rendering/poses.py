@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -10,6 +11,11 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 
 def random_pose(rng: np.random.Generator) -> RigidTransform:
     return RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), 5 * rng.normal(size=3))
+
+
+def rigid(rotation_vector: ArrayLike, translation: ArrayLike) -> RigidTransform:
+    rotation = Rotation.from_rotvec(rotation_vector).as_matrix()
+    return RigidTransform.from_matrix(rotation, np.array(translation))
 
 
 def displaced(pose: RigidTransform, seed: int, m: float = 0.1, deg: float = 2.0) -> RigidTransform:
@@ -27,6 +33,13 @@ def pose_errors(pose: RigidTransform, truth: RigidTransform) -> tuple[float, flo
     turn = Rotation.from_matrix(pose.rotation_matrix() @ truth.rotation_matrix().T)
     distance_m = np.linalg.norm(pose.center() - truth.center())
     return float(distance_m), float(np.degrees(turn.magnitude()))
+
+
+def error_vector(pose: RigidTransform, truth: RigidTransform) -> NDArray[np.float64]:
+    """Return (6,): rotation vector and translation of the step from the pose to the truth."""
+    step = truth @ pose.inverse()
+    vector = Rotation.from_matrix(step.rotation_matrix()).as_rotvec()
+    return np.concatenate([vector, step.translation])
 
 
 def located(result: Pose | Failure) -> Pose:

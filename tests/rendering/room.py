@@ -1,4 +1,4 @@
-"""A closed room with two boxes, ray-cast exactly: two lights, and what moves through it."""
+"""A ray-cast room with two boxes, two lights and a moving object."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ _TEXTURE_PX = 256
 
 @dataclass(frozen=True, eq=False)
 class RoomImage:
-    """uint8 (H, W, 3), the depth float32 (H, W) of a sensor next to the camera, and
-    where something moves."""
+    """Image uint8 (H, W, 3), depth float32 (H, W), and the mask of the moving object."""
 
     image: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -38,7 +37,7 @@ class RoomImage:
 
 @cache
 def _texture(seed: int) -> NDArray[np.float64]:
-    """Colours (256, 256, 3) in 0 to 1; wraps around."""
+    """Return periodic colours (256, 256, 3), 0 to 1."""
     rng = np.random.default_rng(seed)
     image = np.zeros((_TEXTURE_PX, _TEXTURE_PX, 3))
     for sigma, strength in ((3.0, 1.0), (8.0, 1.2), (24.0, 1.5)):
@@ -52,7 +51,7 @@ def _texture(seed: int) -> NDArray[np.float64]:
 def _hit_box(
     origin: NDArray[np.float64], rays: NDArray[np.float64], box: tuple, *, inside: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Distance (N,) to a box in lengths of the rays, and the face: axis, plus 3 on its far side."""
+    """Return distances (N,) in lengths of the rays, and faces: axis, plus 3 on the far side."""
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = ((side - origin) / rays for side in box)
     near, far = np.fmin(a, b), np.fmax(a, b)
@@ -131,7 +130,7 @@ def render(
 
 
 def poses(count: int, seed: int) -> list[RigidTransform]:
-    """Cameras about the middle of the room that look every way."""
+    """Return cameras near the middle of the room with any direction."""
     rng = np.random.default_rng(seed)
     result = []
     for number in range(count):

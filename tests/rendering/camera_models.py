@@ -1,13 +1,11 @@
-"""A camera of every model."""
+"""A camera of every model, 640 x 480 pixels."""
 
 from __future__ import annotations
-
-import pytest
 
 from megloc_kapture.values import Camera
 
 F, CX, CY = 500.0, 321.0, 238.5
-PARAMS = {
+_PARAMS = {
     "SIMPLE_PINHOLE": (F, CX, CY),
     "PINHOLE": (F, 510.0, CX, CY),
     "SIMPLE_RADIAL": (F, CX, CY, -0.05),
@@ -20,8 +18,7 @@ PARAMS = {
     "RADIAL_FISHEYE": (F, CX, CY, 0.02, -0.01),
     "THIN_PRISM_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 1e-3, -1e-3, 1e-3, 0.0, 1e-3, -1e-3),
 }
-
-
-@pytest.fixture(scope="session")
-def cameras() -> dict[str, Camera]:
-    return {model: Camera(model, 640, 480, params) for model, params in PARAMS.items()}
+CAMERAS = {model: Camera(model, 640, 480, params) for model, params in _PARAMS.items()}
+PINHOLE = CAMERAS["PINHOLE"]
+# a lens whose image does not reach the corners: their pixels have no ray
+STRONG = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
