@@ -106,7 +106,7 @@ def _models(path: Path) -> list[Path]:
 
 
 def _holds_model(folder: Path) -> bool:
-    # one file may be missing: its error comes later
+    # a missing file is reported later
     return any(sum((folder / n).is_file() for n in ns) > 1 for ns in (BINARY_FILES, TEXT_FILES))
 
 

@@ -62,7 +62,7 @@ def input_files(root: Path) -> Iterator[Path]:
 
 def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
     """Warn of true poses of unknown queries: the image names may be wrong."""
-    message = "%s: true poses of %d images that are no query are left out, the first is %s"
+    message = "%s: true poses of %d images that are not queries are left out, the first is %s"
     _log.warning(message, folder, len(images), images[0])
 
 

@@ -1,7 +1,7 @@
 """NVM files of VisualSFM, as exported by COLMAP and published by challenges.
 
 Cameras have centres instead of translations, and distortion of the opposite sign to COLMAP's. The
-file has no image sizes and principal points.
+file has neither image sizes nor principal points.
 """
 
 from __future__ import annotations
@@ -105,6 +105,6 @@ def _parse_points(lines: list[str], images: int) -> SparsePoints:
         and np.isfinite(values).all()
         and (seen[:, :2] >= 0).all()
         and (seen[:, 0] < images).all(),
-        f"a point is broken or names an unknown image, from {lines[0][:40]!r} on",
+        f"malformed point or unknown image, from {lines[0][:40]!r} on",
     )
     return SparsePoints.of_rows(heads[:, :6], heads[:, 6], seen)

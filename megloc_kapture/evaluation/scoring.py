@@ -130,7 +130,7 @@ class Evaluation(Reported):
     without_truth, not_scored : images that are reported but not counted, sorted.
     truth_known_by : owner of true poses that are not published.
     pairs : name of a query -> its pair, for the MLAD challenges.
-    nowhere : queries that show nothing of the map; right without a pose, and in no row.
+    nowhere : queries that show nothing of the map; correct without a pose, and in no row.
     by_center : of MLAD's pairs, the evaluation by the distance of camera centres.
     covariance : ``num_poses`` with a covariance, and ``num_within`` its 95 % region.
     alignment : note on how the poses were, or could be, aligned with the truth.

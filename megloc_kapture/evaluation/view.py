@@ -55,9 +55,9 @@ _MAX_COLOR_IMAGES = 150
 _SEED = 0
 # tan(80 degrees): wider frusta hide everything
 _WIDEST = 5.7
-# quantiles of points and cameras that are seen first
+# quantiles of points and cameras that are initially in view
 _SEEN_AT_FIRST = 0.02, 0.98
-# a view has this within its first bytes
+# marker in the first bytes of a view
 _OURS, _HEAD_BYTES = b'content="megloc view"', 1000
 _ANY_CAMERA = Camera.pinhole(4, 3, 4)  # for unknown intrinsics
 
@@ -124,14 +124,14 @@ def write_view(
     if result is not None:
         evaluation = _evaluate(result, truth, folder)
         context, queries = evaluation.context, shown_queries(evaluation)
-        # cameras that were estimated with the poses come first
+        # cameras that were estimated with the poses take precedence
         context = replace(context, cameras={**(cameras or {}), **context.cameras})
         title = evaluation.label or title
     elif truth is not None:
         raise OptionError("true poses need a result to compare with")
     scene = scene_of(title, StoredInliers(context), queries)
     if scene is None:
-        raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
+        raise DataError("no image has a pose, so there is nothing to show", path=folder.root)
     write_bytes(path, render_view(scene).encode("utf-8"))
     return " ".join(scene.notes)
 
@@ -195,7 +195,7 @@ def scene_of(
     # separately, so that ten cameras count next to a thousand points
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
-    # few digits, so that JSON has exactly what was subtracted
+    # few digits, so that JSON has the exact origin
     origin = np.round((low + high) / 2, 3)
     rays = _rays(context.queries, [query.image for query in queries], context.cameras)
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)

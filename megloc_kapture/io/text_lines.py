@@ -18,7 +18,7 @@ from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative, named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
-# of R^T R - I; published matrices have six decimals
+# tolerance of R^T R - I; published matrices have six decimals
 MAX_ROTATION_ERROR = 1e-3
 
 
@@ -33,7 +33,7 @@ def reading_lines(path: Path, *, comments: bool = False) -> Iterator[Iterator[st
 
     def lines() -> Iterator[str]:
         nonlocal number
-        for number, text in enumerate(texts, start=1):  # noqa: B007  of the message below
+        for number, text in enumerate(texts, start=1):  # noqa: B007  used in the message below
             if text.strip() and not (comments and text.strip().startswith("#")):
                 yield text.strip()
         number = None

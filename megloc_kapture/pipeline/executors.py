@@ -106,7 +106,7 @@ def open_executor(
     that all workers must see, the current one by default.
     """
     count = available_cores() if workers is None else workers
-    check_option(count >= 1, f"{count} workers cannot work; give 1 or more")
+    check_option(count >= 1, f"{count} workers: give 1 or more")
     if scheduler is not None and kind != "dask":
         raise OptionError("--scheduler needs --executor dask")
     if kind == "dask":

@@ -198,7 +198,7 @@ class LocalType:
         stored = keypoints.keypoints_px(image)
         source = self if keypoints is self.first else keypoints
         descriptors = source.descriptors(image)
-        # keypoints without a point help no pose, but reject wrong matches in the mutual check
+        # keypoints without a point reject wrong matches in the mutual check
         return Features.of(self._map.camera(image), stored, descriptors)
 
 
@@ -316,7 +316,7 @@ class MapMatching:
     def candidates(self, image: QueryImage, features: Sequence[Features]) -> tuple[list[str], bool]:
         """Return the map images to match, and whether they are ranked, best first.
 
-        Those of a small map without global features are not.
+        The images of a small map without global features are all matched, unranked.
         """
         query = image.query
         if query.candidates is not None:
@@ -360,7 +360,7 @@ class MapMatching:
     @cached_property
     def _counted_types(self) -> Sequence[str]:
         names = [local.name for local in self.types]
-        # a foreign map may lack the types of the preset
+        # a map of another tool may lack the types of the preset
         return self.options.reranking.types_named(names) or names
 
     def _permitted(self, query: Query) -> list[str]:
@@ -447,7 +447,7 @@ class MapMatching:
             if local_type in (None, settings.local_type):
                 return name
         name = vlad_type(local_type or base_type(self.types[0].name))
-        return name if name not in self._map.global_types() else f"{name}, trained anew"
+        return name if name not in self._map.global_types() else f"{name}, newly trained"
 
     @cached_property
     def _stored_vocabularies(self) -> dict[str, tuple[Vocabulary, VladSettings]]:
@@ -546,7 +546,7 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class LiveSource:
-    """Matches of one camera, computed with as many candidates as are asked for.
+    """Matches of one camera, computed for the requested number of candidates.
 
     Reranking, a second matcher and guided pyramids need the matches with all candidates first.
     """

@@ -67,8 +67,8 @@ _LIST_SUFFIXES = (".txt", ".csv")
 class Queries(ABC):
     """Query images, read one at a time.
 
-    ``unreadable`` and ``faults`` are reasons, by image name, why images or their features are
-    unusable; faults are filled during reading.
+    ``unreadable`` and ``faults`` give the reason, by image name, why an image or its features
+    are unusable; faults are filled during reading.
     """
 
     def __init__(self) -> None:
@@ -147,7 +147,7 @@ class KaptureQueries(Queries):
             plain = plain_name(base)
             serving = [name for name in brought if plain_name(base_type(name)) == plain]
             if serving and base not in self._local:
-                # a type serves its guided pyramid, and the other way round
+                # a type can replace its guided-pyramid type, and vice versa
                 name = min(serving, key=lambda name: (name != base, name != base_type(name), name))
                 self._local[base] = _StoredType(
                     folder.keypoints(name),
@@ -329,7 +329,7 @@ class Photographs(Queries):
     ) -> None:
         super().__init__()
         if every is not None and every < 1:
-            raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
+            raise OptionError(f"every {every}th frame cannot be used; give 1 or more")
         roots = [Path(path) for path in paths]
         files = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent

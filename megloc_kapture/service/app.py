@@ -324,6 +324,6 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
 
     @app.exception_handler(Exception)
     async def fail(_: Request, __: Exception) -> Response:
-        return JSONResponse({"error": "internal error; the service's log says more"}, 500)
+        return JSONResponse({"error": "internal error; see the service's log"}, 500)
 
     return app

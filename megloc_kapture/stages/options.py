@@ -147,7 +147,7 @@ class PipelineOptions(Options):
         """Return the keypoints types used for localization, VLAD's type first."""
         types = [extractor.name for extractor in self.make_extractors()]
         if twice := _first_twice(types):
-            raise OptionError(f"keypoints type {twice!r} is asked for twice in local_features")
+            raise OptionError(f"keypoints type {twice!r} is listed twice in local_features")
         return types
 
     def main_type(self) -> str:
@@ -159,7 +159,7 @@ class PipelineOptions(Options):
         main_type = self.main_type()
         types = [chosen.type_name(main_type) for chosen in self.global_features]
         if twice := _first_twice(types):
-            raise OptionError(f"global features {twice!r} are asked for twice")
+            raise OptionError(f"global features {twice!r} are listed twice")
         weights = tuple(chosen.weight for chosen in self.global_features)
         return Retrieval(tuple(types), weights, self.fusion)
 

@@ -61,7 +61,7 @@ from megloc_kapture.values import Camera, LocalizationResult, Options, Pose, Rig
 
 # map images held out at once; a larger window wastes work after the last one needed
 _WINDOW = 4
-# map images a refiner may choose from: the nearest that look the query's way
+# map images a refiner may choose from: the nearest with a similar viewing direction
 _MAX_REFERENCES = 30
 
 
@@ -147,13 +147,13 @@ class MapRefiners:
         ]
 
     def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return ``references`` and ``distrusted`` for :func:`apply_refiners`, frame tested."""
+        """Test the frame; return ``references`` and ``distrusted`` for :func:`apply_refiners`."""
         frame = self._frame(pose)
         near = self._by_frame[frame].near(
             pose.cam_from_world,
             pose.candidates,
             max_references=_MAX_REFERENCES,
-            # a pose made elsewhere comes from no cluster
+            # a pose of another program has no cluster
             only_first=bool(pose.candidates),
         )
         return tuple(near), tuple(

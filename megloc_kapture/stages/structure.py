@@ -77,7 +77,7 @@ class MatchPhotographs(MatchMapping):
 
 
 class FindPoses(PipelineStage):
-    """Find poses and cameras of matched photographs; of several models the largest is the map's."""
+    """Find poses and cameras of matched photographs; the largest model becomes the map."""
 
     name = "poses"
     version = 3
@@ -101,7 +101,7 @@ class FindPoses(PipelineStage):
             i for i, sensor in model.sensors.items() if sensor not in data.sensors
         ):
             message = (
-                "%d photographs have the size of others but another camera (a zoom, a crop): %s"
+                "%d photographs have the size of others but a different camera (zoom or crop): %s"
             )
             _log.warning(message, len(separate), ", ".join(separate))
         tables = work.out / SIDE_TABLES

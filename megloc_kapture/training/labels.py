@@ -20,7 +20,7 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
 UNMATCHED, IGNORED = -1, -2
-# glue-factory's distances: matched keypoints are nearer in both images, unmatched ones are farther
+# glue-factory's thresholds: matched keypoints are nearer in both images, unmatched ones are farther
 # from all keypoints of the other image
 POSITIVE_PX, NEGATIVE_PX = 3.0, 5.0
 # largest relative depth difference of a visible point

@@ -68,7 +68,9 @@ class TrainingOptions(NetworkOptions):
     steps: int = Field(default=100_000, gt=0)
     pairs_per_step: int = Field(default=16, gt=0, description="number of pairs per batch")
     learning_rate: float = Field(
-        default=1e-4, gt=0, description="of Adam, for half of the steps; then decays to 1 %"
+        default=1e-4,
+        gt=0,
+        description="learning rate of Adam for half of the steps; then decays to 1 %",
     )
     layers: int = Field(
         default=18,
@@ -76,7 +78,9 @@ class TrainingOptions(NetworkOptions):
         multiple_of=2,
         description="number of attention layers, alternating self and cross",
     )
-    sinkhorn_iterations: int = Field(default=50, gt=0, description="in training and evaluation")
+    sinkhorn_iterations: int = Field(
+        default=50, gt=0, description="iterations in training and evaluation"
+    )
     matcher_weights: str | None = Field(
         default=None, description="initial SuperGlue; none: random weights"
     )
@@ -94,7 +98,7 @@ class DescriptorOptions(TrainingOptions):
 
     through: Literal["superglue", "products"] = Field(
         default="superglue",
-        description="superglue: trained with it, as MegLoc; products: for nearest neighbours",
+        description="superglue: with SuperGlue, as in MegLoc; products: for nearest neighbours",
     )
 
 

@@ -113,7 +113,7 @@ def test_the_pose_file_of_each_result_is_among_the_submissions(
     (run / POSES).unlink()
     assert megloc(*command, *same, "--workspace", run).status == 0  # nobody asked for a copy
     done = megloc(*command, *same, *until, "--workspace", run, "--submissions", "kept")
-    assert done.status == 2 and "no such file; --from submission writes it again" in done.err
+    assert done.status == 2 and "no such file; --from submission rewrites it" in done.err
     again = ("--from", "submission", *until, "--workspace", run, "--submissions", "kept")
     done = megloc(*command, *same, *again)
     assert done.out == f"pose file  {Path('kept') / first.name}\n"
@@ -268,7 +268,7 @@ def test_from_takes_what_another_tool_put_there(
     (workspace / "pairs" / "query.txt").write_text("".join(rows))
     done = evaluate(scene, workspace, "--from", "query_matches", "--until", "localization")
     assert ran(done.err) == list(STAGES[7:9])
-    assert set(map(states(done.err).get, STAGES[:6])) == {"taken as it is"}
+    assert set(map(states(done.err).get, STAGES[:6])) == {"used as is"}
     statuses = read_status(workspace / "localized" / "status.csv")
     assert {q: s.candidates for q, s in statuses.items()} == {
         query: (image,) for query, image in nearest.items()

@@ -183,7 +183,7 @@ def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> N
     place = tmp_path / "submission"
     command = ["submit", "4seasons", "-i", imported / "localized", "-o", place]
     done = megloc(*command)
-    assert done.out == f"3 poses of 4 queries, 1 missing, dummies in their place: {place}\n"
+    assert done.out == f"3 poses of 4 queries, 1 missing, written as dummy poses: {place}\n"
     assert {path.name for path in tmp_path.glob("submission*")} == {place.name, "submission.json"}
     assert [path.name for path in place.iterdir()] == ["a_to_b.txt"]
     tables = ("--side-tables", imported / "megloc")
@@ -238,7 +238,7 @@ def test_a_wrong_file(megloc: Any, aachen: Path, poses: Poses, place: Path) -> N
     assert "0001.png should be 0001.jpg" in others[0]
     assert first.startswith("error: poses.txt: poses inverted (camera-to-world, world_from_cam)")
     assert any("poses.txt:5: 4 columns instead of 8" in line for line in others)
-    assert any("stranger.jpg is no name of the list" in line for line in others)
+    assert any("stranger.jpg is not in the list" in line for line in others)
     assert "quaternion of length 1.41421, not 1" in done.out
     assert outcome.startswith("4 poses of 4 queries: ") and "problems found" in outcome
     done = megloc("check", "aachen", place, "--json")

@@ -41,7 +41,7 @@ def test_info_says_what_the_foreign_map_allows(
     # so few that all are matched; vectors without the weights that make a query's
     every = f"all {images} map images"
     assert told["retrieval"] == f"{every}, not ranked"
-    ranked = f"where queries bring AP-GeM-LM18: {every}, ranked by global features AP-GeM-LM18"
+    ranked = f"if queries have AP-GeM-LM18: {every}, ranked by global features AP-GeM-LM18"
     assert ranked in done.out
     errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
     assert errors is not None

@@ -130,7 +130,7 @@ def test_a_foreign_map_is_refined_and_localized_in(
     covariances = read_point_covariances(out, len(new.points3d()))
     assert covariances is not None
     known = int(np.isfinite(covariances).all(axis=1).sum())
-    assert f"known of {known} points" in told
+    assert f"known for {known} points" in told
     theirs = kapture_from_dir(str(out))
     assert len(theirs.points3d) == len(new.points3d())
     localized = megloc("localize", "-i", out, "--query", place / "query", "-o", tmp_path / "poses")
@@ -161,7 +161,7 @@ def test_poses_without_depth_stay_and_say_so(megloc: Any, finished: Path, tmp_pa
         assert first.startswith("icp: ") and second.startswith("rendering: ")
     command = refine_poses(finished, poses, tmp_path / "none")
     for by, words in (
-        ((), "no pose refiner is chosen; --by takes: field, icp, rendering"),
+        ((), "no pose refiner is chosen; give --by: field, icp, rendering"),
         (
             ("--by", "magic"),
             "no plugin 'magic' in megloc_kapture.pose_refiners; registered: field, icp, rendering",

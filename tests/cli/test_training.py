@@ -215,7 +215,7 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
     for arguments, words in (
         ((), "nothing to render: give --pose and --camera, --along or --between"),
         (("--between", mapping, "--along", mapping), "nothing to render"),
-        ((pose,), "--pose needs the --camera"),
+        ((pose,), "--pose needs --camera"),
         ((pose, *camera, "--appearance", "me.jpg"), "not trained on an image 'me.jpg'"),
         (("--between", out / "none"), "none"),
         *(

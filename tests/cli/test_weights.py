@@ -127,7 +127,7 @@ def test_consent(megloc: Any, folder: Path) -> None:
 
 def test_fetch_refuses(megloc: Any, served: Path, folder: Path) -> None:
     fetch = ("weights", "fetch")
-    megloc(*fetch).refused("say which weights to fetch: free, bound")
+    megloc(*fetch).refused("choose weights to fetch: free, bound")
     megloc(*fetch, "fre").refused(
         "no weights 'fre' in the registry; did you mean 'free'\\? there are"
     )
@@ -159,7 +159,7 @@ def test_add_check_list(megloc: Any, folder: Path, tmp_path: Path) -> None:
     source = source.rename(tmp_path / "model.pth")
     done = megloc("weights", "add", source, "--name", "by-hand")
     assert done.out.startswith(f"by-hand: {folder}/by-hand.pth (loads; sha256 ")
-    assert megloc("weights", "check").out.endswith("no file is wrong\n")
+    assert megloc("weights", "check").out.endswith("all files are correct\n")
     assert megloc("weights", "check", "free").status == 0
     rows = [line.split() for line in megloc("weights", "list").out.splitlines()]
     states = {row[0]: row[-2:] for row in rows[1:5]}

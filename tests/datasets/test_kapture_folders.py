@@ -63,7 +63,7 @@ def test_what_is_imported(root: Path, tmp_path: Path, caplog: pytest.LogCaptureF
     assert sorted(path.name for path in (out / "megloc").iterdir()) == ["protocol.json"]
     write_part(root, "query_gt", ["b/q.png", "s.png"], poses=True, images=False)
     assert import_kapture_folders(root, tmp_path / "c") == counts | {"queries_with_truth": 1}
-    assert "query_gt: true poses of 1 images that are no query" in caplog.text
+    assert "query_gt: true poses of 1 images that are not queries" in caplog.text
     (root / "query_gt/sensors/sensors.txt").unlink()
     assert import_kapture_folders(root, tmp_path / "b") == counts | {"queries_with_truth": 0}
     assert not (tmp_path / "b" / "query_gt").exists()

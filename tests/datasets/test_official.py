@@ -89,7 +89,7 @@ def test_what_is_missing_is_refused_folder_by_folder(
         assert not missing.require(root / "images" / name)
     message = (
         r"official: 4 files are missing: images/lists/night\.txt, images/night/1\.jpg and 2 more "
-        r"in its folder; --allow-missing imports what is there$"
+        r"in its folder; --allow-missing imports the rest$"
     )
     with pytest.raises(DataError, match=message):
         write_official(replace(dataset, missing=missing), tmp_path / "out")
@@ -127,7 +127,9 @@ def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(
     back = world.pose_in_official(found.poses()["q/1.jpg"])
     np.testing.assert_allclose(back.center(), POSE.center(), atol=1e-6)
     np.testing.assert_allclose(back.quat_wxyz, POSE.quat_wxyz, atol=1e-12)
-    assert "true poses of 1 images that are no query are left out, the first is q/2" in caplog.text
+    assert (
+        "true poses of 1 images that are not queries are left out, the first is q/2" in caplog.text
+    )
     (truth / "query" / "sensors" / "sensors.txt").unlink()
     with pytest.raises(DataError, match="sensors.txt: cannot read: the file is missing"):
         read_ground_truth(tmp_path, records("q/1.jpg"), world)

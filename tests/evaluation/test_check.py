@@ -208,7 +208,7 @@ def test_names_with_one_systematic_error(
 def test_endings_and_cameras_of_robotcar(check: Check) -> None:
     names = [name.replace(".jpg", ".png") for name in ROBOTCAR]
     (finding,) = named(check, names, ROBOTCAR, "robotcar")
-    assert finding.severity == "warning" and "takes either" in finding.message
+    assert finding.severity == "warning" and "accepts either" in finding.message
     names = [*ROBOTCAR, *(name.replace("rear", "left") for name in ROBOTCAR)]
     (finding,) = named(check, names, ROBOTCAR, "robotcar")
     assert (finding.severity, finding.kind, len(finding.names)) == ("note", "not-scored", 6)

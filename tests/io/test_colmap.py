@@ -263,7 +263,7 @@ def test_a_disk_without_room_for_the_database_is_said_before_colmap_meets_it(
         return shutil.disk_usage(path)._replace(free=1 << 19)
 
     monkeypatch.setattr("megloc_kapture.io.colmap.disk_usage", usage)
-    with pytest.raises(OutputError, match="0 MB are free, COLMAP's database takes 1 MB"):
+    with pytest.raises(OutputError, match="0 MB are free, COLMAP's database needs 1 MB"):
         triangulate(images, {}, scratch=tmp_path / "map")
     assert asked == [tmp_path / "map"]
     assert list((tmp_path / "map").iterdir()) == []

@@ -109,7 +109,7 @@ def test_what_cannot_be_is_refused() -> None:
         choose_dataset("kapture", Path(), import_options={"version": "1.0"})
     with pytest.raises(OptionError, match="--query-prefix"):
         choose_dataset("inloc", Path(), query_prefix="q")
-    with pytest.raises(OptionError, match="nothing renders 'venice'"):
+    with pytest.raises(OptionError, match="no renderer for 'venice'"):
         twin_of("venice")
 
 

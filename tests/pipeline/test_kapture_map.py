@@ -103,7 +103,7 @@ def test_the_origin_of_the_foreign_map_and_what_the_wrong_one_costs(virtual_gall
     assert (origin.intrinsics, origin.keypoints) == ("centre", "centre")
     assert origin.error_px["centre"] < 0.9 * origin.error_px["corner"]
     wrong = KaptureMap.open(virtual_gallery / "map", pixel_origin="corner")
-    assert (wrong.pixel_origin.intrinsics, wrong.pixel_origin.reason) == ("corner", "as asked for")
+    assert (wrong.pixel_origin.intrinsics, wrong.pixel_origin.reason) == ("corner", "as requested")
     # the map's points, seen from where the queries truly are; no pose can hide the half pixel
     queries, truth = KaptureFolder(virtual_gallery / "query"), virtual_gallery / "query_gt"
     off_px = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])

@@ -286,7 +286,7 @@ def test_a_map_of_other_photographs_is_not_replaced(
     room: Path, made: megloc.Map, tmp_path: Path
 ) -> None:
     others = put(tmp_path / "others", images_of(room)[:4])
-    with pytest.raises(OptionError, match="was made of .*photos; give another folder"):
+    with pytest.raises(OptionError, match="was made from .*photos; give another folder"):
         megloc.map_photographs(others, workspace=room / "workspace", **FEW)
 
 
@@ -302,7 +302,7 @@ def test_what_makes_no_map_is_refused_with_the_reason(room: Path, tmp_path: Path
         write_image(tmp_path / "turned" / f"{at}.png", view)
     for name, words in (
         ("few", "2 photographs are too few for a map; give 3 or more"),
-        ("same", "are all the same one"),
+        ("same", "are identical"),
         ("turned", "taken from one place"),
         ("strangers", "enough of the same things"),
     ):

@@ -130,7 +130,7 @@ CHANGES: dict[str, tuple[Callable[[Kitchen], Any], list[str]]] = {
         lambda k: setattr(k, "version", 2),
         ["a newer version of the stage", "a changed", "a changed"],
     ),
-    "an output gone": (lambda k: k.workspace.path("a.txt").unlink(), ["a.txt is gone", "", ""]),
+    "an output gone": (lambda k: k.workspace.path("a.txt").unlink(), ["a.txt is missing", "", ""]),
     # as of a run cut off before it was written
     "no manifest": (lambda k: k.workspace.manifest_path("b").unlink(), ["", "not done yet", ""]),
 }
@@ -246,7 +246,7 @@ def test_data_of_another_root_do_not_replace_those_of_a_workspace(tmp_path: Path
         root.mkdir(parents=True)
     one, other = roots
     assert import_from(one) == import_from(one) == str(one)
-    with pytest.raises(OptionError, match=f"was made of {one}; give another folder"):
+    with pytest.raises(OptionError, match=f"was made from {one}; give another folder"):
         import_from(other)
     assert import_from(other, force=True) == str(other)
     other.rename(tmp_path / "moved")  # nothing else than these data can be meant

@@ -87,7 +87,7 @@ SEVERAL = 'local_features=["sift", "rootsift"]'
         (["local_features=[]"], "local_features: .*at least 1 item"),
         (
             [SEVERAL, "local_features.options.max_keypoints=7"],
-            r"name one of them: local_features\.sift, local_f",
+            r"choose one of: local_features\.sift, local_f",
         ),
     ],
 )
@@ -130,7 +130,7 @@ def test_local_features_are_named_alone_or_in_a_list(
 
 
 def test_one_type_twice_is_refused() -> None:
-    with pytest.raises(OptionError, match="'sift' is asked for twice"):
+    with pytest.raises(OptionError, match="'sift' is listed twice"):
         options_of_preset(assignments=['local_features=["sift", "sift"]']).local_types()
 
 

@@ -28,7 +28,7 @@ def test_all_missing_weights_are_told_at_once(fountain: Path, tmp_path: Path) ->
 
 def test_vectors_that_cannot_be_are_refused(fountain: Path, tmp_path: Path) -> None:
     twice = options_of_preset(assignments=['global_features=["vlad","vlad"]'])
-    with pytest.raises(OptionError, match="global features 'vlad_rootsift' are asked for twice"):
+    with pytest.raises(OptionError, match="global features 'vlad_rootsift' are listed twice"):
         evaluated(tmp_path / "workspace", fountain, twice)
     wrong = options_of_preset(assignments=["global_features.options.num_clusters=0"])
     with pytest.raises(OptionError, match="'vlad' refuse their options: num_clusters"):

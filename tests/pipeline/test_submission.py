@@ -148,7 +148,7 @@ def test_names_with_white_space_have_no_row(
     counts = write_submission(tmp_path / "localized", place, tables=None, provenance={})
     assert list(read_pose_file(place)) == ["f.jpg"]
     assert (counts["poses"], counts["missing"]) == (1, 2)
-    assert "2 images have no row in the pose file" in caplog.text and "'a b.jpg'" in caplog.text
+    assert "2 images are left out" in caplog.text and "'a b.jpg'" in caplog.text
     # by its last part the second can be called
     write_protocol(tmp_path / "megloc", Protocol(pose_file_names="basename"))
     counts = write_submission(
@@ -220,7 +220,7 @@ def test_what_cannot_be_handed_in_is_refused(dataset: Dataset, tmp_path: Path) -
     place = tmp_path / "poses.txt"
     dataset.localize(dataset.query.image_names(), {})
     write_sensors(dataset.root / "query", replace(dataset.query, rigs={}))
-    with pytest.raises(DataError, match="no pose can come from the rig"):
+    with pytest.raises(DataError, match="poses cannot be derived from the rig"):
         submit(dataset, place, from_rig=True)
     write_protocol(dataset.tables, Protocol(dataset="robotcar", pose_file_names="basename"))
     write_groups(dataset.tables, {})
@@ -422,7 +422,11 @@ def test_weights_are_those_of_the_stages_that_a_result_is_made_of(
         ("synthetic", "kapture", None),
         ("kapture", "synthetic", None),
         ("kapture", "my-own-scene", None),
-        ("aachen", "robotcar", r"aachen is asked for, and .*protocol\.json is of dataset robotcar"),
+        (
+            "aachen",
+            "robotcar",
+            r"aachen was requested, but .*protocol\.json is for dataset robotcar",
+        ),
         ("aachen", "kapture", "of dataset kapture"),
         ("kapture", "aachen", "of dataset aachen"),
         ("synthetic", "synthetic-inloc", "of dataset synthetic-inloc"),

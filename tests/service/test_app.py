@@ -261,4 +261,4 @@ def test_internal_errors_hide_paths(
 
         monkeypatch.setattr(localizer, "localize_query", fail)
         with client_of(localizer, threads=1) as client:
-            refused(client.post("/localize", **photos[0].form()), 500, "log says more")
+            refused(client.post("/localize", **photos[0].form()), 500, "see the service's log")

@@ -258,7 +258,7 @@ def test_all_masks_are_combined(
     new, counts = run(street, tmp_path / "of_pattern", {"fixed": fixed})
     np.testing.assert_array_equal(mask_of(new, "side/0.jpg"), drawn > 0)
     assert mask_of(new, "side/2.jpg") is None and mask_of(new, "front/0.png") is None
-    assert caplog.messages == ["a fixed mask fits no image: rear"]
+    assert caplog.messages == ["a fixed mask matches no image: rear"]
 
 
 def test_masks_are_8_bit_and_0_is_ignored(street: KaptureFolder, tmp_path: Path) -> None:
