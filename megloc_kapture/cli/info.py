@@ -142,7 +142,7 @@ def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
             f"{known.width}x{known.height} of the camera and of keypoints"
         )
     if errors:
-        yield f"{len(errors)} images are of another size than their cameras, the first: {errors[0]}"
+        yield f"{len(errors)} images differ in size from their cameras, the first: {errors[0]}"
 
 
 def describe_refinement(console: Console, folder: KaptureFolder) -> None:

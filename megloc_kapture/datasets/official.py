@@ -288,6 +288,6 @@ class KaptureForm:
 
     def without_model(self) -> OptionError:
         return OptionError(
-            f"the reference model is read from the official layout, and {self.root} has kapture "
-            "folders; megloc localize localizes in a kapture map"
+            f"the reference model needs the official layout, but {self.root} has kapture "
+            "folders; use megloc localize for a kapture map"
         )

@@ -227,8 +227,8 @@ def _read_rows(
     text = read_text(path)
     require(
         not pose_files.is_colmap_images(text),
-        "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
-        "and `megloc submit` make one",
+        "this is COLMAP's images.txt, not a pose file; convert it with `megloc import "
+        "colmap` and `megloc submit`",
         path=path,
     )
     is_mlad = kind == "mlad"
@@ -410,7 +410,7 @@ def _check_poses(
     if 2 * len(far) > len(names):
         message = (
             f"{len(far)} of {len(names)} poses are far from every map camera, and no usual "
-            f"convention explains it; is it another frame, or another scale? {shown}"
+            f"convention explains it; are they in another frame or scale? {shown}"
         )
         return [Finding("error", "far", message, names=far_names)]
     message = f"{counted(len(far), 'pose')} far from every map camera: {shown}"

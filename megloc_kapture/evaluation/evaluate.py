@@ -131,8 +131,8 @@ def evaluate_results(
     references = first_map_poses(contexts) if relative else {}
     require(
         not relative or references,
-        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
-        "which are the map's: give it with --map",
+        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their reference "
+        "images: give the map with --map",
     )
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:

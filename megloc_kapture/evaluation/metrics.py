@@ -1,7 +1,9 @@
 """Pose errors, recall at thresholds with its confidence intervals, medians, and confidences.
 
-A pose is correct within the coarsest threshold; every pose of a query that shows nothing of the map
-is wrong. Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015
+A pose is correct if it is within the coarsest threshold; for a query that does not show the map,
+every pose is wrong.
+
+Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015
 (calibration error); Geifman and El-Yaniv, "Selective classification for deep neural networks",
 NeurIPS 2017 (risk against coverage).
 """
@@ -337,7 +339,7 @@ def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> t
 
 
 def calibration_error(bins: Sequence[Bin]) -> float:
-    """Return the expected calibration error; 0 if a share p of confidence p is correct."""
+    """Return the expected calibration error: mean |confidence - share of correct poses|."""
     filled = [b for b in bins if b.num_poses]
     total = sum(b.num_poses for b in filled)
     distances = (abs(b.share_right - b.mean_confidence) * b.num_poses for b in filled)

@@ -123,7 +123,7 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
 
 
 def is_colmap_images(text: str) -> bool:
-    """Return whether a row is ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, as in ``images.txt``."""
+    """Return whether row 1 is ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, as in ``images.txt``."""
     _, fields = next(_rows(text), (0, []))
     return len(fields) >= 10 and fields[0].isdecimal() and fields[8].isdecimal()
 
@@ -148,9 +148,9 @@ def poses_by_image(
 ) -> dict[str, RigidTransform]:
     """Rename the poses of a pose file to the images of a kapture folder.
 
-    A name matches, in this order: the challenge's list ``names`` (image -> name), an image, the end
-    of one image's path, an image that ends the name, and the same with another ending (``.jpg`` for
-    ``.png``, as servers accept). Other names are kept; the evaluation reports them.
+    A name is looked up in this order: in the challenge's list ``names`` (image -> name), as an
+    image, as the end of one image's path, as a path that ends with an image, and with another
+    suffix (servers accept ``.jpg`` for ``.png``). Other names are kept and reported later.
     """
     known = set(images)
     listed = {name: image for image, name in (names or {}).items()}

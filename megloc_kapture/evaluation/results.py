@@ -279,7 +279,7 @@ def _read_mlad(
             )
     elif path.name not in asked and len(asked) > 1:
         raise DataError(
-            "which relocalization file it answers is not clear; call it as that one: "
+            "cannot tell which relocalization file it belongs to; give it the name of that file: "
             f"{', '.join(sorted(asked))}",
             path=path,
         )

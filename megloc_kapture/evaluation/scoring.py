@@ -300,7 +300,7 @@ def query_result(
         outcome, reason = "fallback", status.reason
     else:
         outcome = "missing"
-        reason = status.reason or "status says localized, but the result has no pose"
+        reason = status.reason or "the status is localized, but the result has no pose"
     known = {each.name: getattr(status, each.name) for each in fields(LocalizationResult)}
     known |= {"cam_from_world": pose, "reason": reason, "name": image}
     if pose is None:

@@ -351,7 +351,7 @@ def _has_depth(root: Path) -> bool:
     has_depth = bool(depth_records(data))
     if data.records_depth and not has_depth:
         message = (
-            "%s: no rig joins the depth sensors to cameras of their moments; depth is not used"
+            "%s: no rig links depth sensors to cameras at the same timestamps; depth is not used"
         )
         _log.warning(message, root)
     return has_depth

@@ -299,7 +299,7 @@ def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dic
             # only their difference is measured
             agree = origin.keypoints == origin.intrinsics
             keypoints = intrinsics if agree else origin.keypoints
-            reason = f"{origin.reason}; of the intrinsics {most} says {intrinsics}"
+            reason = f"{origin.reason}; intrinsics from {most}: {intrinsics}"
             origin = replace(origin, intrinsics=intrinsics, keypoints=keypoints, reason=reason)
         origins[name] = origin
     return origins

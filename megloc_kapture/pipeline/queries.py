@@ -108,8 +108,8 @@ class Preprocessor:
         masks = options.preprocessing.masks
         check_option(
             masks == MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic),
-            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images: "
-            "make one with `megloc preprocess`; a query brings its own mask: Query(mask=...)",
+            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images "
+            "(`megloc preprocess`); give the mask of a query as Query(mask=...)",
         )
 
     def of(self, query: Query) -> QueryImage:

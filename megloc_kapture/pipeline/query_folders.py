@@ -351,8 +351,8 @@ class Photographs(Queries):
         warn_of_scaled(roots[0], self._scaled)
         if self.names and self.without_row == self.names:
             raise OptionError(
-                f"the list of cameras has no row of any image, as of {self.names[0]}: its first "
-                "fields are names of images"
+                f"the list of cameras has none of the images, for example {self.names[0]}: the "
+                "first field of each row is an image name"
             )
 
     def known_cameras(self) -> bool:
@@ -464,7 +464,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         elif path.exists():
             require(
                 path.suffix.lower() not in _LIST_SUFFIXES,
-                "not an image; a list of cameras is given by --camera",
+                "not an image; give a list of cameras with --camera",
                 path=path,
             )
             files = {path.name: path}
@@ -473,8 +473,8 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         for name, file in files.items():
             if name in by_name:
                 raise DataError(
-                    f"{by_name[name]} has the same name below the folder that was given; give the "
-                    "folder that holds both",
+                    f"{by_name[name]} has the same path relative to its given folder; give a "
+                    "common parent folder",
                     path=file,
                 )
             _check_name(name, file)

@@ -90,7 +90,7 @@ def triangulate_map(
         raise DataError(
             f"no point could be triangulated: {sum(map(len, of_type.values()))} of the image pairs "
             "have verified matches. Check that the images overlap, and that their poses "
-            "(cam_from_world) and cameras are right",
+            "(cam_from_world) and cameras are correct",
             path=mapping.root,
         )
     _write_map(mapping, output, xyz, observations)

@@ -63,7 +63,7 @@ from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
 
-CACHED_IMAGES = 80  # per process: about 250 MB of RootSIFT
+CACHED_IMAGES = 80  # in each process; about 250 MB of RootSIFT
 _PAIRS_PER_ITEM = 32  # pairs of one image, whose features are read once
 # image groups in which the given poses are checked against the matches
 _CHECKED_GROUPS = 6
@@ -75,7 +75,7 @@ Verification = KnownPoseOptions | TwoViewOptions | None
 
 
 class SecondMatchingOptions(Options):
-    """Second pass of matching: the best pairs again, with another matcher."""
+    """Second pass of matching: the best pairs are matched again by another matcher."""
 
     matcher: PluginChoice | None = Field(
         default=None,
@@ -182,7 +182,7 @@ def best_pairs(
 ) -> list[tuple[str, str]]:
     """Return the ``number`` pairs with the most verified matches of each first image, sorted.
 
-    With ``of_both`` also those of each second image. Ties are in order of the names.
+    With ``of_both`` also those of each second image. Ties are broken by name.
     """
     chosen: set[tuple[str, str]] = set()
     taken: Counter[str] = Counter()
@@ -392,7 +392,7 @@ EXPLAINED = ("map", *MATCHING_OPTIONS)
 
 
 def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
-    """Read the pairs of map images, without photographs that have no pose."""
+    """Read the pairs of map images, without those of unregistered photographs."""
     names = set(mapping.read().image_names())
     return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
 
@@ -432,7 +432,7 @@ class MatchMapping(PipelineStage):
 
 
 class MatchQueries(PipelineStage):
-    """Match and verify queries with their candidates, before reranking with all of them."""
+    """Match queries with their candidates and verify the matches."""
 
     name = "query_matches"
     version = 4

@@ -98,9 +98,9 @@ class MapRefiners:
     ) -> None:
         if options.refines() and unit_of(mapping.root) != METRES:
             raise OptionError(
-                f"pose_refinement.by {options.by[0].name}: its limits are in metres, and the map's "
-                "scale is not known; `megloc map --scale` makes a map in metres, `megloc import "
-                "colmap --unit m` says that a COLMAP model is in metres"
+                f"pose_refinement.by {options.by[0].name}: its limits are in metres, but the map's "
+                "scale is unknown; `megloc map --scale` makes a map in metres, `megloc import "
+                "colmap --unit m` declares that a COLMAP model is in metres"
             )
         self.refiners = tuple(options.make_refiners(placement))
         self.map = FolderSpec(mapping)

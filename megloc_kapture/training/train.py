@@ -182,7 +182,7 @@ class Trainer:
         }
 
     def evaluate(self) -> list[float]:
-        """Return COLUMNS from the fourth on, means over the held-out sources; NaN without any."""
+        """Return the fourth and later COLUMNS: means over held-out sources, NaN without these."""
         self.model.eval()
         self.results = {
             name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
@@ -246,15 +246,15 @@ def train(
 
     Each evaluation writes ``output`` (``X.safetensors``), for descriptors trained through SuperGlue
     also ``X-superglue.safetensors``, the manifest ``X.json``, the curves ``X.csv`` and
-    ``X.state.pt``, from which the same call resumes; ``X.overlaps`` is written before. Returns the
-    last row of the curves.
+    ``X.state.pt``, from which the same call resumes. ``X.overlaps`` caches the overlap of image
+    pairs. Returns the last row of the curves.
 
     Parameters
     ----------
     kaptures, held_out : with poses and depth; ``held_out`` for evaluation only.
     photographs : folders of images, for homographies.
     force : replace another training's files.
-    threads : prepare pairs.
+    threads : number of threads that prepare pairs.
     """
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
@@ -312,7 +312,7 @@ def _check_same_training(output: Path, record: Mapping[str, Any]) -> None:
     except (DataError, ValueError, AttributeError):
         known = None
     if known is None:
-        raise OutputError(f"{output}: was not written by a training; -f replaces it")
+        raise OutputError(f"{output}: not the output of a training; -f replaces it")
     if known != record:
         changed = sorted(k for k in {*known, *record} if known.get(k) != record.get(k))
         raise OutputError(
@@ -336,6 +336,6 @@ def _write(trainer: Trainer, output: Path, record: Mapping[str, Any]) -> None:
     results = {name: asdict(result) for name, result in trainer.results.items()}
     manifest = {"training": record, "step": trainer.step, "held_out": results}
     write_json(output.with_suffix(".json"), manifest)
-    # last: a state means that the other files are complete
+    # written last: if the state exists, the other files are complete
     progress = {"step": trainer.step, "rows": trainer.rows}
     write_bytes(output.with_suffix(".state.pt"), state_bytes(model, trainer.optimizer, progress))

@@ -307,7 +307,7 @@ def test_queries_that_fail_are_misses_and_low_recall_fails_when_asked_for(
     assert set(statuses) - set(failed) == {"0001.jpg"}
     assert set(failed) == {"0004.jpg", "0007.jpg", "0010.jpg"}
     assert all(one.startswith("the image cannot be used: ") for one in failed.values())
-    assert "200x100, its camera says 400x300" in failed["0007.jpg"]
+    assert "200x100, its camera expects 400x300" in failed["0007.jpg"]
     # they are not in the pose file, and the other one does not mind
     expected = (finished / POSES).read_text().splitlines(keepends=True)
     assert (run / POSES).read_text() == "".join(r for r in expected if "0001" in r)

@@ -292,7 +292,7 @@ def test_the_parts_are_found(own: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_what_is_missing_is_said_before_the_work(own: Path, tmp_path: Path) -> None:
     found, output = replace(find_colmap(own), database=None), tmp_path / "map"
-    with pytest.raises(DataError, match="no descriptors .*--database.* or the images .*--images"):
+    with pytest.raises(DataError, match="no descriptors .*--database.* or images .*--images"):
         import_colmap(ColmapFolders(found.model, None, None), output)
     for gone, message in (
         (own / "images" / "0003.jpg", "images: 1 of the model's 7 images are not here, .* 0003"),
@@ -336,7 +336,7 @@ def test_the_map_is_as_large_as_its_images(
     )
     found.validate(deep=True)
     Image.new("RGB", (50, 50)).save(own / "images" / name)
-    with pytest.raises(DataError, match=f"{own}.*{name}.*50x50, its camera says.*--images"):
+    with pytest.raises(DataError, match=f"{own}.*{name}.*50x50, its camera expects.*--images"):
         imported(find_colmap(own), tmp_path / "third")
 
 

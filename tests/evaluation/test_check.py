@@ -137,7 +137,7 @@ def test_a_recentred_map(check: Check) -> None:
     assert not check(lines_of(poses), recentred).findings
     forgotten = {name: world.pose_in_local(pose) for name, pose in poses.items()}
     error = only(check(lines_of(forgotten), recentred))
-    assert error.kind == "far" and "another frame, or another scale" in error.message
+    assert error.kind == "far" and "another frame or scale" in error.message
 
 
 def test_single_poses_that_are_far(check: Check) -> None:

@@ -229,7 +229,7 @@ def test_everything_works_in_it_but_what_is_in_metres(
     assert len(pycolmap.Reconstruction(str(tmp_path / "model")).images) == 11
     KaptureFolder(workspace / "map").validate(deep=True)
     # but for what is in metres
-    with pytest.raises(OptionError, match=r"rendering: its limits are in metres, and the"):
+    with pytest.raises(OptionError, match=r"rendering: its limits are in metres, but the"):
         made.localize(room / "photos" / "0003.jpg", refine="rendering")
 
 
@@ -311,7 +311,7 @@ def test_what_makes_no_map_is_refused_with_the_reason(room: Path, tmp_path: Path
     assert not (tmp_path / "of_few").exists()
     wrong = Camera.pinhole(100, 512, 690.0)
     with pytest.raises(
-        DataError, match=r"0 photo.* \(2 more .* 0000.jpg: .*its camera says 100x512"
+        DataError, match=r"0 photo.* \(2 more .* 0000.jpg: .*its camera expects 100x512"
     ):
         megloc.map_photographs(tmp_path / "few", workspace=tmp_path / "wrong", camera=wrong)
 

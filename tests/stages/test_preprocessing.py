@@ -354,7 +354,7 @@ def test_broken_inputs_are_named(street: KaptureFolder, tmp_path: Path) -> None:
     assert refused("broken", undistort=True).path == image
     write_image(image, cloudy(0, 90, 120))
     for options in ({}, {"undistort": True}):
-        assert refused("image is 120x90, its camera says 240x180", **options).path == image
+        assert refused("image is 120x90, its camera expects 240x180", **options).path == image
     os.unlink(image)
     assert refused("no such image").path == image
     image.write_bytes(picture)
