@@ -26,7 +26,7 @@ MAX_ROTATION_ERROR = 1e-3
 def reading_lines(path: Path, *, comments: bool = False) -> Iterator[Iterator[str]]:
     """Yield an iterator of the stripped lines that are not blank; ``comments`` drops # lines.
 
-    Errors of the block get file and line; a ValueError, as of ``float``, becomes a DataError.
+    Errors in the block get file and line; a ValueError (from ``float``) becomes a DataError.
     """
     texts = read_text(path).split("\n")
     number: int | None = None
@@ -95,8 +95,8 @@ _ROW = re.compile(
 class CameraList:
     """Cameras by the names of their images.
 
-    An image gets the row with the longest name that its path ends with, by whole folders; else the
-    only row whose name ends with the image's.
+    An image gets the row with the longest name that is the end of its path (whole folders), else
+    the only row whose name ends with the image name.
     """
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
@@ -106,7 +106,7 @@ class CameraList:
             self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
 
     def of(self, image: str, path: Path) -> Camera | None:
-        """Return the camera of an image by name and file; None without a row."""
+        """Return the camera of an image by name and file; None if no row matches."""
         names = self._by_file.get(PurePosixPath(image).name, [])
         file = path.absolute().as_posix()
         ending = [name for name in names if file.endswith(f"/{name}")]

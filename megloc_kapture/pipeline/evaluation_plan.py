@@ -248,7 +248,7 @@ def _with_model(run: Run) -> DatasetChoice:
     if source is None:
         raise OptionError(
             f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs its "
-            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' avoids these'
+            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' works without'
         )
     return source
 

@@ -35,8 +35,8 @@ _before = ExitStack()  # restores the thread counts
 def single_threaded() -> Iterator[None]:
     """Limit BLAS, OpenMP and torch to one thread, as executors provide the parallelism.
 
-    The last bits of a product may depend on the number of threads. Blocks may overlap in several
-    threads.
+    The last bits of a product may depend on the number of threads. Several
+    threads may be in such a block at once.
     """
     global _num_blocks
     with _lock:

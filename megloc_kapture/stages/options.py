@@ -45,7 +45,7 @@ class LocalFeaturesChoice(PluginChoice):
     """A local feature extractor, its options, and the matching of its features."""
 
     matching: PluginChoice | None = Field(
-        default=None, description="matcher of this type; none: the run's"
+        default=None, description="matcher of this type; none: option matching of the run"
     )
 
 
@@ -79,7 +79,7 @@ class PipelineOptions(Options):
     query_pairs: QueryPairsOptions = QueryPairsOptions()
     reranking: RerankingOptions = RerankingOptions()
     matching: PluginChoice = Field(
-        default=PluginChoice(name="nn"), description="matcher of feature types that name none"
+        default=PluginChoice(name="nn"), description="matcher of feature types without their own"
     )
     verification: Literal["geometric", "mapping", "none"] = Field(
         default="geometric",

@@ -190,8 +190,8 @@ def apply_refiners(
 ) -> Pose:
     """Apply several refiners to the pose of one query; return the last accepted pose.
 
-    ``references`` are map images that may overlap with the query, best first. ``distrusted`` has a
-    reason not to use a refiner, or "", for each.
+    ``references`` are map images that may overlap with the query, best first. ``distrusted`` has,
+    for each refiner, the reason not to use it, or "".
     """
     steps, seconds = [], dict(pose.seconds)
     for refiner, reason in zip(refiners, distrusted, strict=True):
@@ -282,7 +282,7 @@ def refine_poses(
 
 
 def _read_results(localized: KaptureFolder) -> dict[str, LocalizationResult]:
-    """Read results by name: poses of localized queries with covariances, others by their status."""
+    """Read results by name; localized queries become poses with covariances."""
     results = read_status(localized.root / STATUS_FILE)
     table = localized.root / COVARIANCE_FILE
     covariances = read_covariances(table) if table.is_file() else {}

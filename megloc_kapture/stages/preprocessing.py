@@ -194,7 +194,7 @@ class ClassMasks:
 def find_unchanging_regions(
     folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
 ) -> dict[str, UnchangingRegion]:
-    """Find the static region of each camera, by sensor id; if missing, false with a reason.
+    """Find the static region of each camera, by sensor id; it is falsy if there is none.
 
     ``sequences`` are folders with more images of these cameras: for queries, the map.
     """

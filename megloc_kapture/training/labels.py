@@ -119,7 +119,7 @@ def reproject(
 
 
 def overlap(a: PosedView, b: PosedView) -> float:
-    """Return the share of pixels with depth visible in the other image, the smaller of two."""
+    """Return the smaller of the two shares of pixels with depth that the other image sees."""
     shares = []
     for view, other in ((a, b), (b, a)):
         size = view.camera.width, view.camera.height
