@@ -29,8 +29,8 @@ from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
-# error: the server refuses the file, or its figures are wrong as a whole; warning: single poses are
-# wrong, or queries are lost; note: good to know
+# error: the server refuses the file, or all its figures are wrong; warning: some poses are wrong,
+# or queries are lost; note: information
 Severity = Literal["error", "warning", "note"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 # largest number of printed findings of one kind; JSON has all

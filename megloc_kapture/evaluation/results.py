@@ -142,8 +142,8 @@ class Result:
     Attributes
     ----------
     images : queries of the result, sorted; for a pose file only those with a pose.
-    confidences : of poses without a status, from a pose file's JSON file.
-    covariances : image -> (6, 6), as of ``Pose``.
+    confidences : confidences of poses without a status, from a pose file's JSON file.
+    covariances : image -> (6, 6), as in ``Pose``.
     by_pair : poses of the queries of MLAD's pairs, if the result is such a pose file.
     """
 

@@ -74,7 +74,7 @@ class QueryResult(LocalizationResult):
 
 
 class Reported:
-    """Base of everything that has a report."""
+    """Base class of results that have a report."""
 
     __slots__ = ()
 
@@ -131,7 +131,7 @@ class Evaluation(Reported):
     truth_known_by : owner of true poses that are not published.
     pairs : name of a query -> its pair, for the MLAD challenges.
     nowhere : queries that show nothing of the map; correct without a pose, and in no row.
-    by_center : of MLAD's pairs, the evaluation by the distance of camera centres.
+    by_center : evaluation of MLAD's pairs by the distance of camera centres.
     covariance : ``num_poses`` with a covariance, and ``num_within`` its 95 % region.
     alignment : note on how the poses were, or could be, aligned with the truth.
     """

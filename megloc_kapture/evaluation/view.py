@@ -46,7 +46,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
-# inliers of all queries, and of one
+# largest number of drawn inliers, of all queries and of one
 _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
 # reading the inliers of a query takes 20 ms or more
 _MAX_QUERIES_WITH_INLIERS = 300
@@ -69,13 +69,13 @@ class Scene:
     Attributes
     ----------
     origin : float64 (3,), subtracted from all coordinates.
-    points, colors : (P, 3) of the map.
+    points, colors : (P, 3), points of the map.
     camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of map cameras, estimates and truths: the
         centre, then rays at depth 1 through the upper left, upper right, lower right and lower left
         corner of the image; NaN without a pose.
     queries : worst first.
     inliers : float32 (K, 3), ``num_inliers`` of each query in turn.
-    radius : of the visible content around the origin.
+    radius : radius of the visible content around the origin.
     frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
         and ``query_frames`` are indices into them.
     notes : sentences about omissions.

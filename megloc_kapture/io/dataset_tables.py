@@ -47,7 +47,7 @@ RELOCALIZATION_FILE = "relocalization.csv"
 UNREADABLE_FILE = "unreadable.csv"
 UNREGISTERED_FILE = "unregistered.csv"
 NOWHERE_FILE = "nowhere.txt"
-# units of the local frame; a map of unknown scale has its own
+# units of the local frame; a map of unknown scale uses its own
 METRES, NO_METRES = "m", "units"
 
 # a quaternion's length may differ from 1 by less than this; it is then normalised

@@ -33,7 +33,7 @@ def read_content(path: Path | str) -> bytes:
 
 
 def read_text(path: Path | str) -> str:
-    """Return the text of a UTF-8 file without its byte order mark; line ends stay as they are."""
+    """Return the text of a UTF-8 file without its byte order mark; line endings are kept."""
     content = read_content(path)
     try:
         text = content.decode("utf-8-sig")
@@ -48,7 +48,7 @@ def read_text(path: Path | str) -> str:
 
 @contextlib.contextmanager
 def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
-    """Turn an error of the block into a DataError that names this file or folder.
+    """Convert an error in the block to a DataError that names this file or folder.
 
     ``what`` is the expected content; without it, only an OSError is converted.
     """
@@ -159,7 +159,7 @@ def output_error(path: Path | str, error: OSError) -> OutputError:
 
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Turn an ``OSError`` into the :class:`OutputError` of writing ``path``."""
+    """Convert an ``OSError`` to the :class:`OutputError` of writing ``path``."""
     try:
         yield
     except OSError as error:

@@ -75,7 +75,7 @@ def staged_output(
 ) -> Iterator[Path]:
     """Yield a staging folder whose content moves to ``folder`` when the block succeeds.
 
-    Files of the last command of the same kind are removed, unless ``adds`` is set; others stay.
+    Files of the last command of the same kind are removed, unless ``adds`` is set; others are kept.
     """
     folder = Path(folder)
     check_claim(folder, kind=kind, force=force)
@@ -139,8 +139,8 @@ def _merge(source: Path, target: Path) -> None:
 def files_below(*folders: Path) -> Iterator[Path]:
     """Yield the files below folders, without archives, hidden files and outputs of commands.
 
-    Links are followed. The files of an unpacked download do not change
-    when its archive is deleted.
+    Links are followed. For an unpacked download they are the same before and after
+    its archive is deleted.
     """
     for root in folders:
         for place, names, files in os.walk(root, followlinks=True):

@@ -93,7 +93,7 @@ def write_submission(
     Parameters
     ----------
     place : the file; for MLAD a folder with one file per relocalization file.
-    tables : the workspace's ``megloc/`` folder; without it, poses stay in the map frame.
+    tables : the workspace's ``megloc/`` folder; without it, all queries count, in the map frame.
     provenance : entries for the provenance (dataset, preset, options).
     from_rig : derive missing poses from the rig.
 

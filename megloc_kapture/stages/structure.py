@@ -134,8 +134,8 @@ class FindPoses(PipelineStage):
         photographs = []
         for image in images:
             sensor, px = data.record_of(image)[1], keypoints.read(image)[:, :2]
-            is_unlabelled = data.sensors[sensor].name == ""
-            photographs.append(Photograph(image, sensor, data.camera_of(image), px, is_unlabelled))
+            is_doubtful = data.sensors[sensor].name == ""
+            photographs.append(Photograph(image, sensor, data.camera_of(image), px, is_doubtful))
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
         putative = {(pair.image, pair.other): pair.matches for pair in counts}
         reader = mapping.matches(local_type)
