@@ -1,7 +1,7 @@
 """Visual localization in kapture: MegLoc's stages as kapture plugins.
 
 >>> import megloc_kapture as megloc
->>> m = megloc.open_map("somebody_elses_map")                               # doctest: +SKIP
+>>> m = megloc.open_map("shared_map")                                       # doctest: +SKIP
 >>> found = m.localize("query.jpg", megloc.Camera.pinhole(1920, 1080, 1371))  # doctest: +SKIP
 >>> found.cam_from_world if found else found.reason                         # doctest: +SKIP
 """
@@ -72,7 +72,7 @@ __all__ = [
     "train",
 ]
 
-# lazy: an error must not import numpy, nor a value the solvers
+# lazy: an error class does not import numpy, nor a value type the solvers
 _LAZY = {
     "values": ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"),
     "pipeline.kapture_map": ("KaptureMap",),

@@ -1,7 +1,7 @@
-"""The package in a few calls: open or build a map, localize in it, run a benchmark, evaluate.
+"""High-level API: open or build a map, localize in it, run a benchmark, evaluate.
 
 >>> import megloc_kapture as megloc
->>> m = megloc.open_map("somebody_elses_map")                                 # doctest: +SKIP
+>>> m = megloc.open_map("shared_map")                                         # doctest: +SKIP
 >>> pose = m.localize("photo.jpg")                                            # doctest: +SKIP
 >>> m.localize("query_kapture/", refine="icp").save("localized")              # doctest: +SKIP
 """
@@ -67,7 +67,7 @@ Files = list[str] | list[Path] | tuple[Path | str, ...]
 
 
 class Map:
-    """A kapture map with its localization options. The map is never written to.
+    """A kapture map with its localization options. The map is read-only.
 
     Attributes
     ----------
@@ -161,8 +161,8 @@ class Map:
         query : image file; uint8 (H, W, 3) RGB; a pillow image; a list of image files; a kapture
             folder, or a folder of plain images.
         camera : intrinsics of the pixels as stored, with COLMAP's models and pixel origin. Without
-            one, an image is rotated upright by its EXIF orientation, and its focal length, from
-            EXIF or guessed, is estimated with the pose: ``Pose.camera``.
+            one, an image is rotated upright by its EXIF orientation, and its focal length,
+            initialised from EXIF or a guess, is estimated with the pose: ``Pose.camera``.
         prior : names of the map images to match with one image.
         refine : names of pose refiners, applied in order: icp, rendering.
         workers : threads, for lists and folders.
@@ -300,7 +300,7 @@ def map_photographs(
     Parameters
     ----------
     images : photographs, videos, or folders of them.
-    camera : shared by all, for the pixels as stored; else focal lengths, from EXIF or guessed, are
+    camera : camera of all images, for the pixels as stored; without it, focal lengths are
         estimated with the poses.
     scale : ``"gps"`` for EXIF positions, or the names of two photographs and their distance in
         metres. Without it the map is not metric: ``map.kapture_map.unit``.
@@ -339,7 +339,7 @@ class FinishedRun:
 
     @cached_property
     def map(self) -> Map:
-        """The map, localized in with the options of the run."""
+        """The map, with the options of the run."""
         return Map(KaptureMap.open(self.workspace / MAP), self.options)
 
     @property
@@ -379,7 +379,7 @@ def run(
     Parameters
     ----------
     root : the dataset as published; searched in MEGLOC_DATA by default.
-    preset : that of the dataset's benchmark file by default.
+    preset : by default the one in the dataset's benchmark file.
     set : options, ``{"localization.rank.name": "perceptual"}``.
     workspace : ``runs/DATASET-PRESET`` by default; for kapture folders
         ``runs/kapture-ROOT-PRESET``.
@@ -396,7 +396,7 @@ def run(
 
 
 def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any) -> ImageFeatures:
-    """Extract local features of an image by the name of the extractor.
+    """Extract local features of an image with a named extractor.
 
     ``image`` is an image file or uint8 (H, W, 3) RGB; ``options`` are the extractor's. PluginError
     or MissingWeightsError if the extractor cannot be loaded.
@@ -410,7 +410,7 @@ def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any
 def match(
     matcher: str, first: ImageFeatures, second: ImageFeatures, **options: Any
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Match two images by the name of a matcher: int64 (K, 2) rows, and scores (K,).
+    """Match two images with a named matcher; return rows, int64 (K, 2), and scores (K,).
 
     PluginError or MissingWeightsError if the matcher cannot be loaded.
     """

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Placement:
-    """Device and precision of networks whose own options name none; part of a run's context."""
+    """Device and precision of networks whose options do not set them; part of a run's context."""
 
     device: Device = "auto"
     half_precision: bool = False
@@ -115,7 +115,7 @@ def plugin_class(group: str, name: str) -> Any:
     protocol = PROTOCOLS[group]
     missing = [member for member in _members(protocol) if not hasattr(kind, member)]
     if not isinstance(kind, type) or missing:
-        what = "is no class" if not isinstance(kind, type) else f"lacks {', '.join(missing)}"
+        what = "is not a class" if not isinstance(kind, type) else f"lacks {', '.join(missing)}"
         raise PluginError(
             f"plugin {name!r} ({entries[0].value}) does not fulfil {protocol.__name__}: it {what}"
         )
@@ -148,7 +148,7 @@ def is_ours(kind: type) -> bool:
 
 
 def has_precision(plugin: object) -> bool:
-    """Return whether a plugin computes by a network, alone or by plugins of its choice."""
+    """Return whether a plugin, or one that it uses, runs a network."""
     return hasattr(getattr(plugin, "options", None), "half_precision")
 
 

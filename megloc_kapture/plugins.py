@@ -67,8 +67,8 @@ class LocalFeatureExtractor(Protocol):
     ) -> LocalFeatures:
         """Extract from an RGB image, uint8 (H, W, 3), only on True pixels of the mask (H, W).
 
-        DataError for a rejected image, for example a too small one: guided pyramid matching then
-        skips that scale.
+        Raise DataError to reject an image, for example if it is too small; guided pyramid matching
+        then skips that scale.
         """
         ...
 
@@ -167,7 +167,7 @@ class DepthView:
     Attributes
     ----------
     camera : of the depth sensor.
-    depth_m : float32 (H, W), along the optical axis; 0, less or NaN where unknown.
+    depth_m : float32 (H, W), along the optical axis; 0, negative or NaN where unknown.
     image_from_depth : from the depth camera's frame to that of the image.
     """
 
@@ -221,7 +221,7 @@ class DepthEstimator(Protocol):
     ) -> DepthEstimate:
         """Estimate the depth of the reference's pixels.
 
-        MeglocError for unusable views; the image then stays without depth, with the reason.
+        Raise MeglocError for unusable views; the image then stays without depth, with the reason.
 
         Parameters
         ----------
@@ -235,7 +235,7 @@ class RankingScene(Protocol):
     """Data for rankers and refiners, read on demand."""
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
-        """Return RGB pixels (H, W, 3) of a query image; DataError without any."""
+        """Return RGB pixels (H, W, 3) of a query image; raise DataError if it has none."""
         ...
 
     def query_mask(self, name: str) -> NDArray[np.bool_] | None:
@@ -247,7 +247,7 @@ class RankingScene(Protocol):
         ...
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
-        """Return RGB pixels (H, W, 3) of a map image; DataError without any."""
+        """Return RGB pixels (H, W, 3) of a map image; raise DataError if it has none."""
         ...
 
     def map_mask(self, name: str) -> NDArray[np.bool_] | None:

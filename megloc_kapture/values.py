@@ -274,7 +274,7 @@ class PoseRefinement:
     Attributes
     ----------
     cam_from_world : the refined pose, or the old one if rejected.
-    reason : of a rejection; empty if accepted.
+    reason : reason of a rejection; empty if accepted.
     measures : numbers by name for tables, such as residuals before and after.
     covariance : as in :class:`Pose`, or None.
     method, before, moved_m, turned_deg : name of the refiner, initial ``cam_from_world`` and the
@@ -317,14 +317,14 @@ class LocalizationResult:
     clusters : results of all tried clusters of candidates before refinement, that of the best
         candidate first.
     cluster : index of the pose's cluster in ``clusters``.
-    score : of a cluster's pose in the ranking, higher is better.
+    score : ranking score of a cluster's pose, higher is better.
     refinements : results of the pose refiners, in their order.
     remarks : skipped steps, with the missing data of query or map, and doubts about the focal
         length.
     fallback : pose that a failed query gets instead: ``retrieval``, that of its best candidate;
         ``rig``, that of another camera through the rig.
     seconds : by step, from feature extraction on.
-    name : of the query.
+    name : name of the query.
     """
 
     cam_from_world: RigidTransform | None = None

@@ -120,7 +120,7 @@ def camera_of_text(text: str) -> Camera:
         model, width, height, *params = text.split(",")
         return Camera(model.strip(), int(width), int(height), tuple(map(float, params)))
     except (ValueError, DataError) as error:
-        reason = error.message if isinstance(error, DataError) else "not such a list"
+        reason = error.message if isinstance(error, DataError) else "malformed"
         raise OptionError(
             f"--camera {text}: {reason}; give MODEL,WIDTH,HEIGHT,PARAMETERS, as in "
             "SIMPLE_RADIAL,4032,3024,3100,2016,1512,0.02"
@@ -204,7 +204,7 @@ class Linked:
     """Flags of commands that read kapture folders."""
 
     allow_links_below: Folders = ()
-    """Accepted for older scripts: links in kapture folders may lead anywhere."""
+    """Accepted for older scripts: links in kapture folders are always followed."""
 
     @property
     def features_dirs(self) -> tuple[Path, ...]:

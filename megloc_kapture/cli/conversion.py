@@ -117,7 +117,7 @@ class Import(Common):
             console.say(f"{what}: {path or 'none'}")
         console.counts(counts)
         if self.unit == NO_METRES:
-            console.say("unit: units of the map, of unknown scale; --unit m if in metres")
+            console.say("unit: unknown scale; use --unit m if the map is in metres")
 
     def _import_megadepth(self, console: Console) -> None:
         chosen = assigned(self.set)
@@ -222,4 +222,4 @@ class View(Linked, Common):
             import webbrowser
 
             if not webbrowser.open(self.output.resolve().as_uri()):
-                console.say("no browser could be started; open the file in one")
+                console.say("no browser could be started; open the file manually")

@@ -113,7 +113,7 @@ class Submit(Common):
     side_tables: Path | None = None
     """The megloc/ folder of the imported dataset; if omitted, the one next to the result."""
     from_rig: bool = False
-    """Give a query without a pose the pose of another camera of its rig at the same moment."""
+    """Derive missing poses from another camera of the rig at the same timestamp."""
     force: Overwrite = False
     """Overwrite the pose file and its JSON file."""
 
@@ -160,14 +160,14 @@ def summary(counts: Mapping[str, int]) -> str:
         text += f" that are scored ({counts['queries']} in all)"
     parts = [
         f"{counts['missing']} missing" if counts["missing"] else "",
-        "dummies in their place" if counts["dummies"] else "",
-        f"{counts['fallbacks']} of the poses guessed" if counts["fallbacks"] else "",
+        "written as dummy poses" if counts["dummies"] else "",
+        f"{counts['fallbacks']} of the poses are guesses" if counts["fallbacks"] else "",
         f"{counts['from_rig']} from the rig" if counts["from_rig"] else "",
     ]
     return ", ".join([text, *filter(None, parts)])
 
 
-# user errors, as wrong data are
+# same exit status as user errors
 PROBLEMS_FOUND = 2
 _RUNS = Path("runs")
 
@@ -228,5 +228,5 @@ class Check(Common):
             return workspaces[0]
         if workspaces:
             names = ", ".join(map(str, workspaces))
-            console.say(f"compared with none of {names}: choose with --data")
+            console.say(f"not compared: choose one of {names} with --data")
         return None

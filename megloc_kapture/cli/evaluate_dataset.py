@@ -49,7 +49,7 @@ class Eval(Deciding, Working):
     """Folder for a copy of the pose file and its provenance, without overwriting those of another
     result. If omitted, submissions/, or none with --workspace."""
     import_option: Texts = ()
-    """An option of the dataset, as megloc import --set takes it: key=value (version=1.0,
+    """An option of the dataset, as for megloc import --set: key=value (version=1.0,
     location_prior=false); may be repeated."""
     config: Path | None = None
     """Benchmark file (TOML) with this dataset's options, instead of the built-in one."""
@@ -64,7 +64,7 @@ class Eval(Deciding, Working):
     dry_run: bool = False
     """List the stages that would run, and why."""
     explain: bool = False
-    """List all stages, on or off, with the options that decide it; run nothing."""
+    """List all stages, on or off, with the deciding options; run nothing."""
     fail_below: float | None = None
     """Exit with 3 if recall at the last threshold (0 to 1) is lower."""
     force: Overwrite = False

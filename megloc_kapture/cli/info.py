@@ -142,7 +142,7 @@ def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
             f"{known.width}x{known.height} of the camera and of keypoints"
         )
     if errors:
-        yield f"{len(errors)} images are of another size than their cameras, the first: {errors[0]}"
+        yield f"{len(errors)} images differ in size from their cameras, the first: {errors[0]}"
 
 
 def describe_refinement(console: Console, folder: KaptureFolder) -> None:
@@ -153,7 +153,7 @@ def describe_refinement(console: Console, folder: KaptureFolder) -> None:
         return
     largest = point_deviations(covariances)[:, 2]
     known = largest[np.isfinite(largest)]
-    line(console, "uncertainty", f"known of {len(known)} points")
+    line(console, "uncertainty", f"known for {len(known)} points")
     if len(known):
         at = np.quantile(known, _QUANTILES)
         text = ", ".join(f"{100 * q:g} %: {d:.3g}" for q, d in zip(_QUANTILES, at, strict=True))
@@ -194,7 +194,7 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
     line(console, "retrieval", retrieval.describe_candidates(()))
     if brought := opened.global_types():
         text = retrieval.describe_candidates(brought)
-        line(console, "", f"where queries bring {', '.join(brought)}: {text}")
+        line(console, "", f"if queries have {', '.join(brought)}: {text}")
 
 
 def line(console: Console, name: str, text: str) -> None:
@@ -210,7 +210,7 @@ class OptionsCommand(Common):
     preset: str = DEFAULT_PRESET
     """Show the values of this preset."""
     basic: bool = False
-    """Only the ten options that are changed most often."""
+    """Show only the ten options that are changed most often."""
 
     def run(self, console: Console) -> None:
         every = list(options_of(options_of_preset(self.preset)))

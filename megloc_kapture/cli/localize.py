@@ -176,7 +176,7 @@ class Serve(Reading, Deciding, Common):
         }
         for name, value in limits.items():
             flag = f"--{name.replace('_', '-')}"
-            check_option(value is None or value > 0, f"{flag} {value}: give more than 0")
+            check_option(value is None or value > 0, f"{flag} {value}: must be positive")
         token = None if self.token_file is None else _read_token(self.token_file)
         if token is None and self.host not in _LOOPBACK:
             raise OptionError(

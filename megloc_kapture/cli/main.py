@@ -90,7 +90,7 @@ def _parser(given: Sequence[str]) -> Any:
     if given and not given[0].startswith("-") and given[0] not in [*COMMANDS, *stages]:
         known = suggestion(given[0], [*COMMANDS, *stages], listed="commands: ")
         raise OptionError(f"unknown command {given[0]!r}; {known}")
-    annotated: Any = Annotated  # of runtime types, which mypy does not follow
+    annotated: Any = Annotated  # mypy does not follow runtime types
     completes = given[:1] and given[0].startswith("--tyro-")  # shell completion needs all commands
     texts = {name: f"Run the stage {name}, of another package." for name in stages}
     texts |= _help_texts()
@@ -110,7 +110,7 @@ def _stop(how: str, status: int) -> NoReturn:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; exit with 0, 1 (defect), 2 (user's error), 3, 130 (Ctrl-C) or 143.
+    """Run a command; exit with 0, 1 (internal error), 2 (user error), 3, 130 (Ctrl-C) or 143.
 
     ``arguments`` default to those of the process.
     """
@@ -140,9 +140,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _tell(error: BaseException, debug: bool) -> int:
-    """Print a user error, a line each, and return the exit status; reraise internal errors."""
+    """Print the lines of a user error and return the exit status; reraise internal errors."""
     if isinstance(error, BrokenPipeError):
-        # our reader has gone; the flush at exit must not complain
+        # broken pipe: the flush at exit must not complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     if isinstance(error, MeglocError):

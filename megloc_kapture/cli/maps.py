@@ -174,7 +174,7 @@ class RefinePoses(Linked, StageCommand):
     output: Output
     """Kapture folder of the refined result, with status.csv and the tables of refinement."""
     by: Texts = ()
-    """Pose refiner: icp, rendering or field; repeat to run several one after another; if omitted,
+    """Pose refiner: icp, rendering or field; repeat to apply several in order; if omitted,
     the preset's."""
     force: Force = False
 
@@ -185,7 +185,7 @@ class RefinePoses(Linked, StageCommand):
             options = options.with_refiners(self.by)
         if not options.refines():
             names = ", ".join(plugin_names(POSE_REFINERS))
-            raise OptionError(f"no pose refiner is chosen; --by takes: {names}")
+            raise OptionError(f"no pose refiner is chosen; give --by: {names}")
         with self.staged(self.output, LOCALIZED, force=self.force) as (out, work):
             counts = refine_poses(
                 self.kapture_map(self.input),

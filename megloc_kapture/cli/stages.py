@@ -122,7 +122,7 @@ class ExtractLocal(Linked, StageCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Match(Reading, StageCommand):
-    """Match and verify image pairs; with known poses within a map, else by a two-view model."""
+    """Match image pairs; verify matches by known poses within a map, else by a two-view model."""
 
     input: Input
     """Kapture folder of the map."""
@@ -250,11 +250,11 @@ class PairsMapping(Reading, StageCommand):
     output: Output
     """Pairs file."""
     by: tuple[PairingMethod, ...] = ("retrieval",)
-    """Method; several are united."""
+    """Pairing method; the pairs of several methods are combined."""
     topk: int | None = None
     """Number of most similar images per image (retrieval)."""
     covisibility_map: Path | None = None
-    """Kapture map of the same images, for the points that they share; if omitted, the input."""
+    """Kapture map of the same images whose points define covisibility; if omitted, the input."""
     features: tuple[str, ...] = ()
     """Types of global features, several are fused; required if several exist."""
     fusion: FusionMethod | None = None
@@ -306,8 +306,8 @@ class PairsQuery(Reading, StageCommand):
     rerank: int | None = None
     """Rerank the candidates by local matches and keep this many."""
     rerank_by: Literal["coverage", "verified", "matches"] = "coverage"
-    """Score of a candidate: its matches, the verified ones (two-view geometry), or coverage (of
-    these, at keypoints that better candidates do not match)."""
+    """Score of a candidate: its matches, its verified matches (two-view geometry), or coverage
+    (verified matches at keypoints that no better candidate matches)."""
     local_features: tuple[str, ...] = ()
     """Types of local features to rerank by; if omitted, all types of map and queries."""
     matches_dir: Path | None = None
@@ -357,7 +357,7 @@ class PairsQuery(Reading, StageCommand):
         asked = self.local_features or sorted(both)
         check_option(
             asked,
-            f"{query.root}: no local features that the map has as well; give their folder "
+            f"{query.root}: no type of local features in common with the map; give their folder "
             "with --features-dir",
         )
         return [only_type(mapping, "descriptors", name) for name in asked]
@@ -430,7 +430,7 @@ class Preprocess(Linked, Computing, Working):
     dynamic: tuple[str, ...] = ()
     """Classes to mask; if omitted, the segmenter's dynamic classes."""
     bottom_share: Texts = ()
-    """Mask the bottom of a camera's images: CAMERA=0.2, a sensor id or a pattern of image names."""
+    """Mask the bottom of images: CAMERA=0.2; CAMERA is a sensor id or a pattern of image names."""
     polygon: Texts = ()
     """Mask a polygon: CAMERA="x,y x,y x,y", corners in shares of width and height."""
     mask_file: Texts = ()
@@ -438,7 +438,7 @@ class Preprocess(Linked, Computing, Working):
     unchanging: bool = False
     """Detect and mask the static ego-vehicle region of each camera."""
     sequence: Folders = ()
-    """Further kapture folder with images of the same cameras for --unchanging; may be repeated."""
+    """Additional images of the same cameras (kapture folder) for --unchanging; may be repeated."""
     user_masks: Path | None = None
     """Folder of masks IMAGE.png, 0 for ignored pixels."""
     set: Texts = ()

@@ -1,4 +1,4 @@
-"""``megloc train``, ``train-field`` and ``render``: networks, and a map as a neural field."""
+"""``megloc train``, ``train-field`` and ``render``: feature networks and neural fields."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Train(Linked, Common):
     """Overwrite the files of another training."""
 
     def run(self, console: Console) -> None:
-        # torch imports slowly
+        # slow import
         from megloc_kapture.pipeline.presets import options_with
         from megloc_kapture.training.train import TASKS, train
 
@@ -218,7 +218,7 @@ class Render(Linked, Working):
         from megloc_kapture.stages.neural_field import open_field
 
         if self.pose is None or self.camera is None:
-            raise OptionError("--pose needs the --camera")
+            raise OptionError("--pose needs --camera")
         pose, camera = _pose_of_text(self.pose), camera_of_text(self.camera)
         endings: list[tuple[Path, tuple[str, ...]]] = [(self.output, WRITABLE_SUFFIXES)]
         if self.depth is not None:

@@ -79,7 +79,7 @@ class Fetch(Common):
             if not names:
                 console.result(f"{self.preset}: no weights are missing")
         elif not names:
-            raise OptionError(f"say which weights to fetch: {', '.join(registry())}")
+            raise OptionError(f"choose weights to fetch: {', '.join(registry())}")
         wanted, refused = [], []
         for name in names:
             try:
@@ -165,7 +165,7 @@ class Check(Common):
         wrong = sum(_wrong(console, lookup(name)) for name in self.names)
         if not self.names:
             wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) == "there")
-        console.result(f"wrong files: {wrong}" if wrong else "no file is wrong")
+        console.result(f"wrong files: {wrong}" if wrong else "all files are correct")
         return WRONG_FILES if wrong else 0
 
 

@@ -106,7 +106,7 @@ def _models(path: Path) -> list[Path]:
 
 
 def _holds_model(folder: Path) -> bool:
-    # one file may be missing: its error comes later
+    # a missing file is reported later
     return any(sum((folder / n).is_file() for n in ns) > 1 for ns in (BINARY_FILES, TEXT_FILES))
 
 
@@ -140,7 +140,7 @@ class ColmapReconstruction:
                 )
                 if source.database is None:
                     raise DataError(
-                        f"{message}; `megloc import colmap` takes their folder by --images",
+                        f"{message}; give their folder with `megloc import colmap --images`",
                         path=source.images,
                     )
                     # the database has the features
@@ -184,9 +184,8 @@ class ColmapReconstruction:
                 local_type = None if feature_type is None else feature_type[0]
         require(
             local_type is not None or source.images is not None,
-            "there are no descriptors to match queries with: `megloc import colmap` takes the "
-            "database that the model was made of (--database), or the images to extract them "
-            "from (--images)",
+            "there are no descriptors to match queries with: give `megloc import colmap` the "
+            "database of the model (--database), or images to extract them from (--images)",
             path=source.model,
         )
         if not len(self.model.points):
@@ -249,8 +248,8 @@ def _scaled_cameras(source: ColmapFolders, model: ColmapModel) -> dict[int, Came
     scaled, errors = cameras_of_images(model.cameras, files)
     if errors:
         raise DataError(
-            f"{errors[0].message}; `megloc import colmap` takes the folder of the images that the "
-            "model was made of by --images",
+            f"{errors[0].message}; give the folder of the model's original images with `megloc "
+            "import colmap --images`",
             path=errors[0].path,
         )
     warn_of_scaled(source.images, [(model.cameras[key], new) for key, new in scaled.items()])

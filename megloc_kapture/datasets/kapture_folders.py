@@ -48,7 +48,7 @@ def check_root(root: Path) -> Path:
         require(
             is_kapture(root / part),
             f"{part}/{_SENSORS} is missing; a dataset of kapture folders has mapping/ and query/, "
-            "and query_gt/ where the true poses are known",
+            "and query_gt/ if true poses are known",
             path=root,
         )
     return root
@@ -61,8 +61,8 @@ def input_files(root: Path) -> Iterator[Path]:
 
 
 def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
-    """Warn of true poses of unknown queries: the image names may be wrong."""
-    message = "%s: true poses of %d images that are no query are left out, the first is %s"
+    """Warn about true poses of unknown queries: the image names may be wrong."""
+    message = "%s: true poses of %d images that are not queries are left out, the first is %s"
     _log.warning(message, folder, len(images), images[0])
 
 
@@ -168,7 +168,7 @@ def check_image_size(path: Path, camera: Camera) -> None:
 
 def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> DataError:
     return DataError(
-        f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
+        f"the image is {size[0]}x{size[1]}, its camera expects {camera.width}x{camera.height}",
         path=path,
     )
 

@@ -3,7 +3,7 @@
 The layout is that of the published archives and of D2-Net's ``megadepth_utils``::
 
     phoenix/S6/zl548/MegaDepth_v1/SCENE/dense0/depths/NAME.h5    depth of the undistorted images
-    depth_undistorted/SCENE/NAME.h5                              the same in glue-factory
+    depth_undistorted/SCENE/NAME.h5                              the same, as in glue-factory
     Undistorted_SfM/SCENE/{images,sparse or sparse-txt}          COLMAP's image_undistorter
     scene_info/SCENE.npz                                         paths, intrinsics, poses
 
@@ -47,7 +47,7 @@ class _Image:
 def import_megadepth(
     root: Path, output: Path, scenes: Sequence[str] = (), *, work: Work = HERE
 ) -> dict[str, int]:
-    """Write each scene, by default all, as ``output/SCENE``; without images of no metric depth."""
+    """Write scenes (default: all) as ``output/SCENE``; skip images without metric depth."""
     scenes = list(map(check_component, scenes)) or _scenes(root)
     require(scenes, f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
     counts = {"scenes": 0, "images": 0, "without_depth": 0}

@@ -1,7 +1,7 @@
 """NVM files of VisualSFM, as exported by COLMAP and published by challenges.
 
 Cameras have centres instead of translations, and distortion of the opposite sign to COLMAP's. The
-file has no image sizes and principal points.
+file has neither image sizes nor principal points.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDA
             quat_wxyz = unit_quaternion((w, x, y, z))
             cameras[check_relative(name.removeprefix("./"))] = [focal, *quat_wxyz, *center, k]
     require(
-        cameras and len(cameras) == count, f"{len(cameras)} of {count} cameras, each image once"
+        cameras and len(cameras) == count,
+        f"found {len(cameras)} different images, expected {count}",
     )
     values = np.array(list(cameras.values())).reshape(-1, 9)
     require(np.isfinite(values).all(), "not all cameras are finite")
@@ -80,7 +81,7 @@ def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDA
 
 
 def _read_points(rows: Iterator[str], count: int, images: int, with_points: bool) -> SparsePoints:
-    """Read rows of X Y Z R G B, the number of observations, and these: image feature x y."""
+    """Read rows: X Y Z R G B, number of observations, then image feature x y for each."""
     parts = []
     while count:
         lines = list(islice(rows, min(_ROWS, count)))
@@ -105,6 +106,6 @@ def _parse_points(lines: list[str], images: int) -> SparsePoints:
         and np.isfinite(values).all()
         and (seen[:, :2] >= 0).all()
         and (seen[:, 0] < images).all(),
-        f"a point is broken or names an unknown image, from {lines[0][:40]!r} on",
+        f"malformed point or unknown image, from {lines[0][:40]!r} on",
     )
     return SparsePoints.of_rows(heads[:, :6], heads[:, 6], seen)

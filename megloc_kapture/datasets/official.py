@@ -102,7 +102,7 @@ class Missing:
         raise DataError(
             f"{len(self.files)} files are missing: {', '.join(parts[:_MISSING_SHOWN])}"
             + (f", and files of {more} more folders" if more > 0 else "")
-            + "; --allow-missing imports what is there",
+            + "; --allow-missing imports the rest",
             path=self.root,
         )
 
@@ -227,7 +227,7 @@ class KaptureImage:
 
 @dataclass(frozen=True)
 class KaptureForm:
-    """The kapture folders of a dataset, the map's first."""
+    """The kapture folders of a dataset; the first is the map."""
 
     root: Path
     folders: tuple[Path, ...]
@@ -288,6 +288,6 @@ class KaptureForm:
 
     def without_model(self) -> OptionError:
         return OptionError(
-            f"the reference model is read from the official layout, and {self.root} has kapture "
-            "folders; megloc localize localizes in a kapture map"
+            f"the reference model needs the official layout, but {self.root} has kapture "
+            "folders; use megloc localize for a kapture map"
         )

@@ -127,12 +127,12 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         return DataError(message, path=self.path)
 
 
-# features of the same model differ by printed digits only
+# features of the same model differ by rounding only
 _MAX_SHIFT_PX = 1.0
 
 
 WITHOUT_DATABASE = (
-    "The reference model comes without descriptors: its database is not there. "
+    "The reference model comes without descriptors: its database is missing. "
     "`megloc localize` extracts them again from the images."
 )
 
@@ -234,7 +234,7 @@ def _keypoints_of(
     features: NDArray[np.int64],
     xy_px: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return the keypoints of an image, and the row of each of the model's features in them.
+    """Return the keypoints of an image, and the keypoint row of each feature of the model.
 
     ``stored`` is the image's name in the database, whose keypoints must agree with the model's.
     """
@@ -249,9 +249,7 @@ def _keypoints_of(
     if fits:
         shifts = np.abs(keypoints[features] - xy_px)
         fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
-    require(
-        fits, f"is not of this model: its features of {stored!r} are others", path=database.path
-    )
+    require(fits, f"is not of this model: its features of {stored!r} differ", path=database.path)
     return keypoints, features
 
 
@@ -262,7 +260,7 @@ def _write_descriptors(
     lengths: Mapping[str, int],
     sources: Mapping[str, str],
 ) -> None:
-    """Write the descriptors of images with ``lengths`` keypoints; ``sources`` name them there."""
+    """Write descriptors of images with ``lengths`` keypoints; ``sources`` are the stored names."""
     (kind, dtype), size = feature_type, 0
     writer: FeatureWriter | None = None
     for name in sorted(lengths, key=lambda name: lengths[name] == 0):  # sizes before empty files

@@ -29,17 +29,17 @@ from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
-# error: the server refuses the file, or its figures are wrong as a whole; warning: single poses are
-# wrong, or queries are lost; note: good to know
+# error: the server refuses the file, or all its figures are wrong; warning: some poses are wrong,
+# or queries are lost; note: information
 Severity = Literal["error", "warning", "note"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-# findings of one kind that are printed; JSON has all
+# largest number of printed findings of one kind; JSON has all
 _SHOWN_OF_A_KIND = 10
 _NAMES_SHOWN = 3
 
 # the server of this dataset accepts .jpg and .png
 _ANY_ENDING = "robotcar"
-# names have a folder; their endings
+# whether names contain a folder, and their endings
 _SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
     "aachen": (False, (".jpg",)),
     "inloc": (False, (".JPG",)),
@@ -227,8 +227,8 @@ def _read_rows(
     text = read_text(path)
     require(
         not pose_files.is_colmap_images(text),
-        "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
-        "and `megloc submit` make one",
+        "this is COLMAP's images.txt, not a pose file; convert it with `megloc import "
+        "colmap` and `megloc submit`",
         path=path,
     )
     is_mlad = kind == "mlad"
@@ -290,7 +290,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
                 continue
             likely = alike or candidates
             if len(likely) != 1:
-                message = f"{name} is no name of the list"
+                message = f"{name} is not in the list"
                 findings.append(Finding("error", "unknown", message, line=line, names=(name,)))
                 continue
             right = wrong[name] = likely[0]
@@ -306,7 +306,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
         only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())
         severity: Severity = "error"
         if only_endings and dataset == _ANY_ENDING:
-            severity, message = "warning", f"{message} (the server takes either)"
+            severity, message = "warning", f"{message} (the server accepts either)"
         elif len(wrong) == len(lines):
             message += "; the server finds none of them, and every figure is zero"
         findings.append(Finding(severity, "name", message, names=tuple(wrong)))
@@ -346,16 +346,20 @@ def _check_pairs(
         what = "with the two timestamps swapped: the reference comes first, then the query"
         return [_about("error", "swapped", swapped, "row", what)]
     findings = [
-        Finding("error", "unknown", f"pair {key} is not asked for", line=lines[key])
+        Finding(
+            "error", "unknown", f"pair {key} is not in the relocalization files", line=lines[key]
+        )
         for key in unknown
     ]
     if missing := [key for key in wanted if key not in lines]:
-        what = f"of {len(wanted)} without a row, and every one needs one"
+        what = f"of {len(wanted)} without a row, which every pair needs"
         findings.append(_about("error", "missing", missing, "pair", what))
     # the identity fills in for a missing pose, and fits no convention
     identity = RigidTransform.identity()
     if dummies := [key for key, pose in read.items() if pose == identity]:
-        findings.append(_about("note", "dummies", dummies, "row", "with the identity, a dummy"))
+        findings.append(
+            _about("note", "dummies", dummies, "row", "with the identity, a placeholder")
+        )
     map_poses, scale = reference.map_poses, reference.world.official_from_local.scale
     poses = {
         key: pose for key, pose in read.items() if pose != identity and wanted.get(key) in map_poses
@@ -388,14 +392,14 @@ def _check_poses(
     shares = [float((d <= near).mean()) for d in distances]
     if better := better_conventions(shares):
         message = (
-            f"{' or '.join(better)}: read so, {max(shares):.0%} of the poses are near the map's "
-            f"cameras, as given {shares[0]:.0%}; the format has cam_from_world with x right, y "
-            "down, z forward"
+            f"{' or '.join(better)}: with this convention, {max(shares):.0%} of the poses are near "
+            f"the map's cameras, as given {shares[0]:.0%}; the format has cam_from_world with x "
+            "right, y down, z forward"
         )
         return [Finding("error", "convention", message)]
     centers = _centers([in_local(name, pose) for name, pose in poses.items()])
     distance = cKDTree(_centers(map_poses)).query(centers)[0]
-    # if the queries were taken apart from the map, their usual distance is not far
+    # queries may all be taken at some distance from the map
     limit = max(extent, min(4 * float(np.median(distance)), 3 * extent))
     order = np.argsort(-distance, kind="stable")
     far = order[distance[order] > limit].tolist()
@@ -406,7 +410,7 @@ def _check_poses(
     if 2 * len(far) > len(names):
         message = (
             f"{len(far)} of {len(names)} poses are far from every map camera, and no usual "
-            f"convention explains it; is it another frame, or another scale? {shown}"
+            f"convention explains it; are they in another frame or scale? {shown}"
         )
         return [Finding("error", "far", message, names=far_names)]
     message = f"{counted(len(far), 'pose')} far from every map camera: {shown}"
@@ -439,7 +443,7 @@ def _ends_alike(name: str, other: str) -> bool:
 def _not_checked(things: str, reference: Reference) -> Finding:
     why = "no imported dataset to compare with; give one with --data"
     if reference.folder:
-        why = f"{reference.folder} does not have what they are compared with"
+        why = f"{reference.folder} lacks the data to compare them with"
     return Finding("note", "not-checked", f"the {things} are not checked: {why}")
 
 

@@ -137,7 +137,7 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
 def mcnemar(only_first: int, only_second: int) -> float:
     """Two-sided p-value of the exact McNemar test.
 
-    Among queries that only one method finds, either method is as likely if both are equally good.
+    Null hypothesis: a query localized by only one method is equally likely localized by either.
     """
     from scipy.special import bdtr
 
@@ -158,7 +158,7 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 def _resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return medians (2000,) of resampled values (N,), which may be infinite.
 
-    The same N draws the same positions, so results on the same queries stay paired.
+    The draws depend on N only, so medians of results on the same queries are paired.
     """
     rng, size = np.random.default_rng(0), (_CHUNK, len(values))
     chunks = (values[rng.integers(len(values), size=size)] for _ in range(NUM_RESAMPLES // _CHUNK))
@@ -179,7 +179,7 @@ def difference_interval(
     return float(low), float(high)
 
 
-CAUTION = "None of these figures is accuracy: results that share a mistake agree."
+CAUTION = "These figures do not measure accuracy: results that share a mistake agree."
 
 
 Quartiles = tuple[float, float, float]
@@ -209,8 +209,8 @@ class AgreementRow:
 class WithoutTruth(Reported):
     """Results without true poses.
 
-    ``statement`` names the owner of the true poses; ``thresholds`` and ``agreement`` are for each
-    pair of results, as is ``apart``: the differences of their poses, infinite where one has none.
+    ``statement`` names the owner of the true poses. ``agreement`` and ``apart`` compare pairs of
+    results; ``apart`` has their pose differences, infinite if a pose is missing.
     """
 
     statement: str
@@ -237,8 +237,8 @@ def evaluate_without_truth(
 ) -> WithoutTruth:
     """Count localized queries, and compare results in one frame with each other.
 
-    ``queries`` are by default all that any result names; ``thresholds`` limit the differences of
-    two results.
+    By default, ``queries`` are all images of the results. ``thresholds`` apply to the pose
+    differences of two results.
     """
     labels = [result.label for result in results]
     if not results or len(set(labels)) != len(labels):
@@ -305,7 +305,7 @@ def _counted(
 
 
 def inliers_quartiles(evaluation: Evaluation, row: str) -> Quartiles | None:
-    """Return 25, 50 and 75 % of the inliers of localized queries; None if unknown."""
+    """Return the quartiles of the inlier counts of localized queries; None if unknown."""
     inliers = [
         query.num_inliers
         for query in compress(evaluation.queries, evaluation.members[row])

@@ -70,7 +70,7 @@ def evaluate(
     ----------
     estimated, truth : kapture folder, pose file, COLMAP model, or image -> ``cam_from_world`` in
         metres. A folder of results may have a ``status.csv``, a folder of true poses a
-        ``nowhere.txt``: one query per line that does not show the map and is right without a pose.
+        ``nowhere.txt``: one query per line that does not show the map, so that no pose is correct.
     dataset : name of the dataset whose thresholds, conditions and pools apply; by default those of
         the side tables.
     side_tables : ``megloc/`` folder of the workspace, by default found near truth or result.
@@ -115,7 +115,7 @@ def evaluate_results(
 ) -> list[Evaluation]:
     """Evaluate several results in their order; see :func:`evaluate`.
 
-    If the benchmark has MLAD's pairs, these count, by MLAD's metric.
+    A benchmark with MLAD pairs is evaluated by MLAD's metric on these.
     """
     if isinstance(truth, Mapping):
         true_poses: Poses = result_in_memory(truth).poses
@@ -127,12 +127,12 @@ def evaluate_results(
     if align == "none":
         _warn_of_unit(contexts)
     elif relative:
-        raise OptionError("--align: the challenge compares relative poses, which need none")
+        raise OptionError("--align: the challenge compares relative poses, which need no alignment")
     references = first_map_poses(contexts) if relative else {}
     require(
         not relative or references,
-        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
-        "which are the map's: give it with --map",
+        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their reference "
+        "images: give the map with --map",
     )
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
@@ -208,7 +208,7 @@ def _by_names_of_results(
     for result in results:
         if result.poses and not (true_poses.keys() | known) & set(result.images):
             raise DataError(
-                f"no name fits: the result has {min(result.images)!r}, the truth "
+                f"no image name matches: the result has {min(result.images)!r}, the truth "
                 f"{min(true_poses, default='nothing')!r}"
                 + (f" ({result.label})" if result.label else "")
             )
@@ -218,9 +218,9 @@ def _by_names_of_results(
 def _in_local_frame(
     true_poses: Poses, results: Sequence[Result], world: World, truth: Path | str
 ) -> Poses:
-    """Bring true poses in the official frame, as a dataset's owner has them, to the local frame.
+    """Transform true poses from the official to the local frame, if necessary.
 
-    They are taken to be official if they then fit the results a thousand times better.
+    They are in the official frame if they then fit the results a thousand times better.
     """
     pairs = [
         (true_poses[i], pose) for r in results for i, pose in r.poses.items() if i in true_poses
@@ -235,7 +235,9 @@ def _in_local_frame(
     as_they_are = median_m(true for true, _ in pairs)
     if 1000 * median_m(world.pose_in_local(true) for true, _ in pairs) >= as_they_are:
         return true_poses
-    _log.warning("%s is in the dataset's official frame, and is brought to that of the map", truth)
+    _log.warning(
+        "%s is in the dataset's official frame, and is transformed to the frame of the map", truth
+    )
     return {image: world.pose_in_local(pose) for image, pose in true_poses.items()}
 
 
@@ -253,11 +255,13 @@ def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
 
 def _warn_of_unit(contexts: Sequence[ResultContext]) -> None:
     if any(context.unit != METRES for context in contexts):
-        _log.warning("the poses are in units of a map of unknown scale, which count as metres")
+        _log.warning(
+            "the poses are in units of a map of unknown scale, which are treated as metres"
+        )
 
 
 def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, str]:
-    """Return the result, aligned if asked for, and a note on the alignment, which may be empty."""
+    """Return the result, aligned if requested, and a note on the alignment (may be empty)."""
     images = sorted(result.poses.keys() & true_poses.keys())
     if align == "none":  # enough for a note; time grows with the square of their number
         images = images[:: -(-len(images) // _MOST_COMPARED) or 1]

@@ -1,7 +1,9 @@
 """Pose errors, recall at thresholds with its confidence intervals, medians, and confidences.
 
-A pose is right within the coarsest threshold; every pose of a query that shows nothing of the map
-is wrong. Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015
+A pose is correct if it is within the coarsest threshold; for a query that does not show the map,
+every pose is wrong.
+
+Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015
 (calibration error); Geifman and El-Yaniv, "Selective classification for deep neural networks",
 NeurIPS 2017 (risk against coverage).
 """
@@ -263,11 +265,11 @@ class Confidence:
     num_poses, num_wrong : poses with a confidence, and those beyond the coarsest threshold.
     wrong_low, wrong_high : 95 % interval of the share of wrong poses.
     num_nowhere_refused : of the queries that show nothing of the map, those without a pose.
-    calibration_error : mean distance of confidence and share of right poses, over bins.
+    calibration_error : mean difference between confidence and share of correct poses, over bins.
     coverage, risk : (num_poses,) share of queries that are accepted, most confident first, and
         share of wrong poses among them.
-    area, least_area, area_by_inliers : area under the risk; the same if every right pose came
-        first; the same if ranked by inliers, None if unknown.
+    area, least_area, area_by_inliers : area under the risk curve; its minimum, with all correct
+        poses first; and the area if ranked by inliers, None if unknown.
     """
 
     num_queries: int
@@ -324,7 +326,7 @@ def confidence_of(
 
 
 def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[Bin, ...]:
-    """Count right poses (N,) in ten bins of equal width over their confidences (N,)."""
+    """Count correct poses (N,) in ten bins of equal width over their confidences (N,)."""
     number = np.clip(np.ceil(confidences * NUM_BINS).astype(int) - 1, 0, NUM_BINS - 1)
     bins = []
     for index in range(NUM_BINS):
@@ -337,7 +339,7 @@ def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> t
 
 
 def calibration_error(bins: Sequence[Bin]) -> float:
-    """Return the expected calibration error; 0 if the share p of poses of confidence p is right."""
+    """Return the expected calibration error: mean |confidence - share of correct poses|."""
     filled = [b for b in bins if b.num_poses]
     total = sum(b.num_poses for b in filled)
     distances = (abs(b.share_right - b.mean_confidence) * b.num_poses for b in filled)
@@ -354,7 +356,7 @@ def risk_by_score(scores: NDArray[np.float64], right: NDArray[np.bool_]) -> NDAr
 
 
 def least_area(right: NDArray[np.bool_]) -> float:
-    """Return the area under the risk if every right pose comes first; 0 without poses."""
+    """Return the area under the risk curve if all correct poses come first; 0 without poses."""
     if not len(right):
         return 0.0
     return float(risk_by_score(right.astype(np.float64), right).mean())

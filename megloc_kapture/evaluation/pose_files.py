@@ -5,8 +5,8 @@ visuallocalization.net (LTVL) takes one line ``name qw qx qy qz tx ty tz`` per q
 A query without a pose has no line.
 
 The MLAD challenges (4Seasons) take ``src_ts tgt_ts tx ty tz qx qy qz qw`` per pair: the pose is
-``query_from_reference`` of the rectified left cameras. A file has the name and every pair of the
-relocalization file that it answers; that one has the same rows, with poses for training recordings
+``query_from_reference`` of the rectified left cameras. A file has the name and
+all pairs of its relocalization file, which has the same rows, with poses for training recordings
 only.
 """
 
@@ -102,7 +102,7 @@ def write_pose_file(path: Path | str, poses: Poses, *, names: Names = "full") ->
 def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     """Read name -> ``cam_from_world`` from a pose file or COLMAP's ``images.txt``, in its order.
 
-    Rows of nan or with a zero quaternion are how other tools write failed queries: they are left
+    Rows of nan or with a zero quaternion, which other tools write for failed queries, are left
     out with a warning. Tabs, CRLF, empty lines and comments are accepted.
     """
     text = read_text(path)
@@ -123,7 +123,7 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
 
 
 def is_colmap_images(text: str) -> bool:
-    """Return whether a row is ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, as in ``images.txt``."""
+    """Return whether row 1 is ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, as in ``images.txt``."""
     _, fields = next(_rows(text), (0, []))
     return len(fields) >= 10 and fields[0].isdecimal() and fields[8].isdecimal()
 
@@ -148,9 +148,9 @@ def poses_by_image(
 ) -> dict[str, RigidTransform]:
     """Rename the poses of a pose file to the images of a kapture folder.
 
-    A name matches, in this order: the challenge's list ``names`` (image -> name), an image, the end
-    of one image's path, an image that ends the name, and the same with another ending (``.jpg`` for
-    ``.png``, as servers accept). Other names stay, for the evaluation to report.
+    A name is looked up in this order: in the challenge's list ``names`` (image -> name), as an
+    image, as the end of one image's path, as a path that ends with an image, and with another
+    suffix (servers accept ``.jpg`` for ``.png``). Other names are kept and reported later.
     """
     known = set(images)
     listed = {name: image for image, name in (names or {}).items()}
@@ -266,7 +266,7 @@ def format_mlad_file(rows: Iterable[RelativePose]) -> str:
     for row in rows:
         pair = f"{row.reference} {row.query}"
         if row.query_from_reference is None:
-            raise DataError(f"pair {pair} has no pose; MLAD wants every row")
+            raise DataError(f"pair {pair} has no pose; MLAD requires every row")
         given = row.query_from_reference
         pose = checked_pose(given.quat_wxyz, given.translation, f"pair {pair}")
         qw, *vector = pose.quat_wxyz
@@ -303,7 +303,7 @@ def parse_timestamp(text: str) -> int:
     return int(text)
 
 
-# what can change a pose or a figure of the report
+# packages that can change a pose or a figure of the report
 PACKAGES = (
     "megloc-kapture",
     "numpy",
@@ -371,7 +371,7 @@ class _Provenance(BaseModel):
 def read_confidences(target: Path | str) -> dict[str, float]:
     """Read image -> confidence from the JSON file of a pose file.
 
-    Empty, with a warning, if the JSON is none of ours or has the SHA-256 of another pose file.
+    Empty, with a warning, if another program wrote the JSON or it belongs to another pose file.
     """
     target, path = Path(target), provenance_path(target)
     if not path.is_file():
@@ -382,6 +382,6 @@ def read_confidences(target: Path | str) -> dict[str, float]:
         _log.warning("%s; its confidences are left out", error)
         return {}
     if provenance.files.get(target.name, "") not in ("", _sha256(target)):
-        _log.warning("%s is of another pose file; its confidences are left out", path)
+        _log.warning("%s belongs to another pose file; its confidences are left out", path)
         return {}
     return provenance.confidence

@@ -107,7 +107,7 @@ class Benchmark:
     def conditions(self, images: Iterable[str]) -> dict[str, str]:
         """Return image -> condition, from the groups of the side tables.
 
-        Without groups a folder that is named like a condition gives it (``query/night/x.jpg``).
+        Without groups, a folder named like a condition defines it (``query/night/x.jpg``).
         """
         if self.groups:
             return {i: self.groups[i].condition for i in images if i in self.groups}
@@ -119,7 +119,7 @@ class Benchmark:
 def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = None) -> Benchmark:
     """Return the benchmark of a workspace's ``megloc/`` folder, of a dataset, or the default.
 
-    A dataset replaces the protocol of the workspace, not its groups and frame.
+    A dataset overrides the protocol of the workspace, but not its groups and frame.
     """
     named = None if dataset is None else protocol_of(dataset)
     if side_tables is None:

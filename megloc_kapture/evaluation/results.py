@@ -142,8 +142,8 @@ class Result:
     Attributes
     ----------
     images : queries of the result, sorted; for a pose file only those with a pose.
-    confidences : of poses without a status, from a pose file's JSON file.
-    covariances : image -> (6, 6), as of ``Pose``.
+    confidences : confidences of poses without a status, from a pose file's JSON file.
+    covariances : image -> (6, 6), as in ``Pose``.
     by_pair : poses of the queries of MLAD's pairs, if the result is such a pose file.
     """
 
@@ -241,7 +241,7 @@ def result_in_memory(
 
 
 def distinct_labels(sources: Sequence[Path]) -> list[str]:
-    """Return the paths without the folders that all of them begin or end with."""
+    """Return the paths without their common leading and trailing folders."""
     if len(sources) < 2:
         return [str(source) for source in sources]
     parts = [source.parts for source in sources]
@@ -252,7 +252,7 @@ def distinct_labels(sources: Sequence[Path]) -> list[str]:
 
 
 def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -> Poses:
-    """Bring poses of a workspace with another local frame to the truth's frame."""
+    """Transform poses of a workspace with another local frame to the truth's frame."""
     side_tables = side_tables_near(result)
     result_world = world if side_tables is None else read_world(side_tables)
     if result_world.official_from_local == world.official_from_local:
@@ -279,7 +279,7 @@ def _read_mlad(
             )
     elif path.name not in asked and len(asked) > 1:
         raise DataError(
-            "which relocalization file it answers is not clear; call it as that one: "
+            "cannot tell which relocalization file it belongs to; give it the name of that file: "
             f"{', '.join(sorted(asked))}",
             path=path,
         )
@@ -288,10 +288,12 @@ def _read_mlad(
         for row in pose_files.read_mlad_file(pose_file):
             asked_pair, pose = asked[file].get((row.reference, row.query)), row.query_from_reference
             if asked_pair is None:
-                problem = f"pair {row.reference} {row.query} is not asked for"
+                problem = f"pair {row.reference} {row.query} is not in the relocalization file"
                 raise DataError(problem, path=pose_file)
             if pose is None:
-                raise DataError("has pairs without poses, as a relocalization file", path=pose_file)
+                raise DataError(
+                    "has pairs without poses, like a relocalization file", path=pose_file
+                )
             if asked_pair.reference not in references:
                 problem = f"reference {asked_pair.reference!r} has no pose in the map"
                 raise DataError(problem, path=pose_file)

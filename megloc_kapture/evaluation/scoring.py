@@ -74,7 +74,7 @@ class QueryResult(LocalizationResult):
 
 
 class Reported:
-    """Base of everything that has a report."""
+    """Base class of results that have a report."""
 
     __slots__ = ()
 
@@ -130,8 +130,8 @@ class Evaluation(Reported):
     without_truth, not_scored : images that are reported but not counted, sorted.
     truth_known_by : owner of true poses that are not published.
     pairs : name of a query -> its pair, for the MLAD challenges.
-    nowhere : queries that show nothing of the map; right without a pose, and in no row.
-    by_center : of MLAD's pairs, the evaluation by the distance of camera centres.
+    nowhere : queries that show nothing of the map; correct without a pose, and in no row.
+    by_center : evaluation of MLAD's pairs by the distance of camera centres.
     covariance : ``num_poses`` with a covariance, and ``num_within`` its 95 % region.
     alignment : note on how the poses were, or could be, aligned with the truth.
     """
@@ -300,7 +300,7 @@ def query_result(
         outcome, reason = "fallback", status.reason
     else:
         outcome = "missing"
-        reason = status.reason or "status says localized, but the result has no pose"
+        reason = status.reason or "the status is localized, but the result has no pose"
     known = {each.name: getattr(status, each.name) for each in fields(LocalizationResult)}
     known |= {"cam_from_world": pose, "reason": reason, "name": image}
     if pose is None:

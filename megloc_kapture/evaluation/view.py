@@ -46,7 +46,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
-# inliers of all queries, and of one
+# largest number of drawn inliers, of all queries and of one
 _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
 # reading the inliers of a query takes 20 ms or more
 _MAX_QUERIES_WITH_INLIERS = 300
@@ -55,9 +55,9 @@ _MAX_COLOR_IMAGES = 150
 _SEED = 0
 # tan(80 degrees): wider frusta hide everything
 _WIDEST = 5.7
-# quantiles of points and cameras that are seen first
+# quantiles of points and cameras that are initially in view
 _SEEN_AT_FIRST = 0.02, 0.98
-# a view has this within its first bytes
+# marker in the first bytes of a view
 _OURS, _HEAD_BYTES = b'content="megloc view"', 1000
 _ANY_CAMERA = Camera.pinhole(4, 3, 4)  # for unknown intrinsics
 
@@ -69,13 +69,13 @@ class Scene:
     Attributes
     ----------
     origin : float64 (3,), subtracted from all coordinates.
-    points, colors : (P, 3) of the map.
+    points, colors : (P, 3), points of the map.
     camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of map cameras, estimates and truths: the
         centre, then rays at depth 1 through the upper left, upper right, lower right and lower left
         corner of the image; NaN without a pose.
     queries : worst first.
     inliers : float32 (K, 3), ``num_inliers`` of each query in turn.
-    radius : of the visible content around the origin.
+    radius : radius of the visible content around the origin.
     frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
         and ``query_frames`` are indices into them.
     notes : sentences about omissions.
@@ -124,14 +124,14 @@ def write_view(
     if result is not None:
         evaluation = _evaluate(result, truth, folder)
         context, queries = evaluation.context, shown_queries(evaluation)
-        # cameras that were estimated with the poses come first
+        # cameras that were estimated with the poses take precedence
         context = replace(context, cameras={**(cameras or {}), **context.cameras})
         title = evaluation.label or title
     elif truth is not None:
         raise OptionError("true poses need a result to compare with")
     scene = scene_of(title, StoredInliers(context), queries)
     if scene is None:
-        raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
+        raise DataError("no image has a pose, so there is nothing to show", path=folder.root)
     write_bytes(path, render_view(scene).encode("utf-8"))
     return " ".join(scene.notes)
 
@@ -195,7 +195,7 @@ def scene_of(
     # separately, so that ten cameras count next to a thousand points
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
-    # few digits, so that JSON has exactly what was subtracted
+    # few digits, so that JSON has the exact origin
     origin = np.round((low + high) / 2, 3)
     rays = _rays(context.queries, [query.image for query in queries], context.cameras)
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)

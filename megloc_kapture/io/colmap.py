@@ -120,7 +120,8 @@ def focal_from_matches(
 ) -> float | None:
     """Estimate the focal length in pixels of an otherwise known camera by P4Pf in a RANSAC.
 
-    Matches (N, 2), (N, 3) that are not finite are ignored. None without a pose of enough inliers.
+    Matches (N, 2), (N, 3) that are not finite are ignored. Return None if
+    no pose has enough inliers.
     """
     usable = np.isfinite(points_px).all(axis=1) & np.isfinite(points).all(axis=1)
     if np.count_nonzero(usable) < 4:
@@ -214,7 +215,7 @@ def triangulate(
         pipeline.num_threads = num_threads
         # threads sum many residuals in varying order, which changes the last bits
         pipeline.ba_min_num_residuals_for_cpu_multi_threading = NEVER
-        # used for tracks of many images only; no effect on a point is known
+        # used for long tracks only, without a known effect on points
         pipeline.random_seed = pipeline.triangulation.random_seed = 0
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
         pipeline.triangulation.min_angle = _MIN_ANGLE_DEG
@@ -236,7 +237,7 @@ def database_folder(
     num_keypoints: Sequence[int],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
 ) -> Iterator[str]:
-    """Yield a folder for a database after a check of the free space: COLMAP aborts without."""
+    """Yield a folder for a database after checking free space: COLMAP aborts on a full disk."""
     place = tempfile.gettempdir() if scratch is None else scratch
     # matches are written twice, keypoints as float32; the rest is SQLite and its journal
     needed = 16 * sum(map(len, matches.values())) + 8 * sum(num_keypoints)
@@ -249,7 +250,7 @@ def database_folder(
             free = disk_usage(folder).free
             if free < needed:
                 raise OutputError(
-                    f"{place}: {free >> 20} MB are free, COLMAP's database takes {needed >> 20} MB"
+                    f"{place}: {free >> 20} MB are free, COLMAP's database needs {needed >> 20} MB"
                 )
             yield folder
     except OSError as error:

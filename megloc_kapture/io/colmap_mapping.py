@@ -39,7 +39,7 @@ from megloc_kapture.values import Camera, RigidTransform
 Mapper = Literal["incremental", "global"]
 _FOLDERS = {"depth": "depth_maps", "normal": "normal_maps"}
 MIN_IMAGES = 3
-# RANSAC finds fewer by chance; COLMAP requires as many inliers to register an image
+# RANSAC may find fewer inliers by chance; COLMAP needs as many to register an image
 _MIN_POINTS = 30
 # a photograph with another zoom, or a crop: its separately estimated focal length differs from the
 # median by more than this, and its reprojection error falls to at most this share
@@ -206,7 +206,7 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
 def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, str]:
     """Map doubtful images with another focal length to the first image of their group.
 
-    Poses and points absorb a wrong camera; it shows in an adjustment with one camera per image.
+    Poses and points absorb a wrong camera; bundle adjustment with a camera per image reveals it.
     """
     pycolmap = load_pycolmap()
     images = [reconstruction.images[number] for number in sorted(reconstruction.reg_image_ids())]
@@ -314,14 +314,14 @@ def _why_none(seen: Sequence[tuple[Any, float]]) -> str:
     if not seen:
         return "no two photographs show enough of the same things to be matched"
     if all(moved_px < _SAME_PX for _, moved_px in seen):
-        return "the photographs are all the same one; take some from other places"
+        return "the photographs are identical; take some from other places"
     kinds = load_pycolmap().TwoViewGeometryConfiguration
     flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
     configs = Counter(config for config, _ in seen)
     if 2 * sum(configs[kind] for kind in flat) > len(seen):
         return (
-            "the photographs were taken from one place, or show nothing but a plane: nothing tells "
-            "how far anything is; walk sideways between photographs"
+            "the photographs were taken from one place, or show nothing but a plane: distances "
+            "cannot be estimated; walk sideways between photographs"
         )
     return (
         f"{len(seen)} pairs of photographs match, but no {MIN_IMAGES} of them are connected; take "
@@ -346,7 +346,7 @@ def write_workspace(
 ) -> None:
     """Write images and model of a stereo workspace (PINHOLE cameras) to the empty folder ``root``.
 
-    Fusion finds an image's neighbours by the points.
+    Fusion selects the neighbours of an image by shared points.
     """
     for image, shown in zip(images, pixels, strict=True):
         path = root / "images" / image.name

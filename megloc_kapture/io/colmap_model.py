@@ -184,7 +184,7 @@ def _camera(camera: Any, path: Path) -> Camera:
     require(
         model in CAMERA_MODEL_NUM_PARAMS,
         f"kapture has no camera model {model}; `colmap image_undistorter` makes a model and "
-        "images with PINHOLE cameras (of panoramas COLMAP's panorama_sfm.py does)",
+        "images with PINHOLE cameras (for panoramas, COLMAP's panorama_sfm.py)",
         path=path,
     )
     with named(path, about=f"camera {camera.camera_id}"):

@@ -120,7 +120,7 @@ def read_records(
 ) -> list[RecordT]:
     """Read a table whose columns are the parameters of ``record``, a dataclass or a function.
 
-    Older files may lack the ``optional`` columns. No file is no record if ``missing_ok``.
+    Older files may lack the ``optional`` columns. With ``missing_ok``, a missing file is empty.
     """
     if missing_ok and not Path(path).exists():
         return []

@@ -1,12 +1,12 @@
-"""The ``megloc/`` folder of a workspace: tables of a dataset that kapture has no room for.
+"""The ``megloc/`` folder of a workspace: tables of a dataset that kapture does not cover.
 
 ==================  ================================================================================
 groups.csv          image, condition, frame, location, scored: one row per image
-priors.csv          query, permitted: group or map image the query may be matched with, row by row
+priors.csv          query, permitted: group or map image that the query may be matched with
 names.csv           image, name: names of scored queries in the pose file, in the challenge's order
 relocalization.csv  file, reference, query: pairs of an MLAD challenge; ``file`` names the pose file
 unreadable.csv      image, reason: queries left out because their image cannot be used
-unregistered.csv    image, reason: photographs that are not in the map made of them
+unregistered.csv    image, reason: photographs that the mapper did not register
 world.json          ``official_from_local``, unit and position on earth of the local frame
 protocol.json       thresholds, format and names of the pose file, conditions and their pools
 ==================  ================================================================================
@@ -47,7 +47,7 @@ RELOCALIZATION_FILE = "relocalization.csv"
 UNREADABLE_FILE = "unreadable.csv"
 UNREGISTERED_FILE = "unregistered.csv"
 NOWHERE_FILE = "nowhere.txt"
-# units of the local frame; a map of unknown scale has its own
+# units of the local frame; a map of unknown scale uses its own
 METRES, NO_METRES = "m", "units"
 
 # a quaternion's length may differ from 1 by less than this; it is then normalised

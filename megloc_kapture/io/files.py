@@ -33,7 +33,7 @@ def read_content(path: Path | str) -> bytes:
 
 
 def read_text(path: Path | str) -> str:
-    """Return the text of a UTF-8 file without its byte order mark; line ends stay as they are."""
+    """Return the text of a UTF-8 file without its byte order mark; line endings are kept."""
     content = read_content(path)
     try:
         text = content.decode("utf-8-sig")
@@ -48,9 +48,9 @@ def read_text(path: Path | str) -> str:
 
 @contextlib.contextmanager
 def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
-    """Turn an error of the block into a DataError that names this file or folder.
+    """Convert an error in the block to a DataError that names this file or folder.
 
-    ``what`` the file should be; without it, only an OSError is converted.
+    ``what`` is the expected content; without it, only an OSError is converted.
     """
     try:
         yield
@@ -125,7 +125,7 @@ def safe_join(root: Path, relative_text: str) -> Path:
 # -------------------------------------------------------------------------------- temporary names
 
 
-TEMPORARY = ".megloc-"  # begins temporary names, which all readers skip
+TEMPORARY = ".megloc-"  # prefix of temporary names, which all readers skip
 
 
 def temporary_name() -> str:
@@ -159,7 +159,7 @@ def output_error(path: Path | str, error: OSError) -> OutputError:
 
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Turn an ``OSError`` into the :class:`OutputError` of writing ``path``."""
+    """Convert an ``OSError`` to the :class:`OutputError` of writing ``path``."""
     try:
         yield
     except OSError as error:
@@ -169,7 +169,7 @@ def writing(path: Path | str) -> Iterator[None]:
 @contextlib.contextmanager
 def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block succeeds; creates parent folders."""
-    # not a Path: making one takes as long as writing the small file of a pair
+    # not a Path: creating one takes as long as writing a small file
     folder = os.path.dirname(path)
     temporary = os.path.join(folder, temporary_name())
     try:

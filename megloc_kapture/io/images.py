@@ -183,7 +183,7 @@ def check_image_file(path: Path) -> None:
 def _check_complete(path: Path | str | None, content: bytes) -> None:
     """Refuse a truncated file, which OpenCV silently fills with grey; Pillow is strict."""
     if content.startswith(b"\xff\xd8"):
-        # entropy-coded data cannot hold these pairs, and a thumbnail's pair precedes both
+        # entropy-coded data never contains these markers, and those of a thumbnail come first
         complete = content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
     else:
         complete = content.startswith(b"\x89PNG") and content.endswith(b"IEND\xaeB`\x82")
@@ -202,7 +202,7 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
     expected = 4 * width * height
     require(
         len(content) == expected,
-        f"{len(content)} bytes, but {width}x{height} float32 take {expected}",
+        f"{len(content)} bytes, but {width}x{height} float32 need {expected}",
         path=path,
     )
     return np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(height, width)
@@ -231,7 +231,7 @@ def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
             number += 1
     finally:
         capture.release()
-    require(number != 0, "no video, or without a frame that OpenCV can read", path=video)
+    require(number != 0, "not a video, or OpenCV cannot read its frames", path=video)
 
 
 # ------------------------------------------------------------------------------ photographs
@@ -252,7 +252,7 @@ class Photo:
 
     @property
     def upright_camera(self) -> Camera:
-        """Camera of the pixels after :func:`turned_upright`."""
+        """Return the camera of the pixels after :func:`turned_upright`."""
         width, height = self.camera.width, self.camera.height
         if self.orientation >= 5:
             width, height = height, width

@@ -29,7 +29,7 @@ _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 def claim_folder(folder: Path, *, kind: str, force: bool = False) -> bool:
     """Create and mark a folder that is new, empty or of the same ``kind`` (one word).
 
-    Others raise OutputError, unless forced. Return whether the mark is new, and may be released.
+    Raise OutputError for others, unless forced. Return whether the mark is new and may be released.
     """
     check_claim(folder, kind=kind, force=force)
     with writing(folder):
@@ -49,7 +49,7 @@ def check_claim(folder: Path, *, kind: str, force: bool = False) -> None:
         if not ours and any(folder.iterdir()):
             raise OutputError(
                 f"{folder}: is not empty and not a {kind} of megloc; give an empty folder, "
-                "or -f to write into it all the same"
+                "or -f to write into it anyway"
             )
 
 
@@ -75,7 +75,7 @@ def staged_output(
 ) -> Iterator[Path]:
     """Yield a staging folder whose content moves to ``folder`` when the block succeeds.
 
-    Files of the last command of the same kind are removed, unless ``adds`` is set; others stay.
+    Files of the last command of the same kind are removed, unless ``adds`` is set; others are kept.
     """
     folder = Path(folder)
     check_claim(folder, kind=kind, force=force)
@@ -139,8 +139,8 @@ def _merge(source: Path, target: Path) -> None:
 def files_below(*folders: Path) -> Iterator[Path]:
     """Yield the files below folders, without archives, hidden files and outputs of commands.
 
-    Links are followed. A download that is unpacked has the same files before and after its
-    archive is deleted.
+    Links are followed. For an unpacked download they are the same before and after
+    its archive is deleted.
     """
     for root in folders:
         for place, names, files in os.walk(root, followlinks=True):
@@ -154,5 +154,5 @@ def _is_data(folder: Path, name: str) -> bool:
     path = folder / name
     if name.startswith(".") or (path / MARKER).is_file():
         return False
-    # a link to a folder around it never ends
+    # a link to a parent folder never ends
     return not (path.is_symlink() and folder.resolve().is_relative_to(path.resolve()))

@@ -1,4 +1,4 @@
-"""The tables of a workspace: views of :class:`~megloc_kapture.values.LocalizationResult`, others.
+"""The tables of a workspace: localization results, map quality and match counts.
 
 ==================== =============================================================================
 status.csv           outcome of every query, with the localized poses
@@ -7,10 +7,10 @@ covariance.csv       uncertainty of every localized pose
 refinement.csv       outcome of refining each query's pose, step by step
 map_consistency.csv  displacement of a map's own images by refinement, by coordinate frame
 depth.csv            stereo depth of the map's images
-match_counts.csv     matches and verified matches of each pair, with the matches of a type
+match_counts.csv     raw and verified matches of each pair, in the folder of a feature type
 ==================== =============================================================================
 
-Readers and writers take the file itself and keep its order, unless they say otherwise.
+Readers and writers take the path of the file and keep its row order, unless noted.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ CONSISTENCY_FILE = "map_consistency.csv"
 def status_row(result: LocalizationResult) -> dict[str, Any]:
     """Return a result as a row of ``status.csv``.
 
-    The columns are the parameters of :func:`_result_of_row`: a new one goes there as well.
+    The columns are the parameters of :func:`_result_of_row`: add new columns there as well.
     """
     return {
         "image": result.name,
@@ -142,7 +142,7 @@ def write_covariances(path: Path, results: Iterable[LocalizationResult]) -> None
 
 
 def write_clusters(path: Path, results: Iterable[LocalizationResult]) -> None:
-    """Write ``clusters.csv``: the clusters of each result, sorted by image, poses unrefined."""
+    """Write ``clusters.csv``: clusters of each result, with unrefined poses, sorted by image."""
     columns = ("image", "cluster", "chosen", "num_matches", "num_inliers", "score", "reason")
     rows = [
         (
@@ -187,7 +187,7 @@ def _refinement_row(
 def read_refinement(
     path: Path | str, refined: Mapping[str, RigidTransform]
 ) -> dict[str, tuple[PoseRefinement, ...]]:
-    """Read ``refinement.csv``: steps by image, of which the last led to the ``refined`` pose."""
+    """Read ``refinement.csv``: steps by image; the last one ended at the ``refined`` pose."""
     by_image: dict[str, list[PoseRefinement]] = {}
     for image, step in read_records(path, _refinement_row):
         by_image.setdefault(image, []).append(step)
@@ -222,10 +222,10 @@ def write_refinement(path: Path, results: Iterable[LocalizationResult]) -> None:
 
 @dataclass(frozen=True)
 class ConsistencyRow:
-    """One row of ``map_consistency.csv``: a refiner's test of one coordinate frame of a map.
+    """One row of ``map_consistency.csv``: a refiner's check of one coordinate frame of a map.
 
     The measures are medians of ``megloc_kapture.refinement.references.Displacement``; NaN if none.
-    ``reason`` is set where query poses are not refined.
+    ``reason`` explains why query poses are not refined; empty if they are.
     """
 
     frame: str

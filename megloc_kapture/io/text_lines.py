@@ -18,7 +18,7 @@ from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative, named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
-# of R^T R - I; published matrices have six decimals
+# tolerance of R^T R - I; published matrices have six decimals
 MAX_ROTATION_ERROR = 1e-3
 
 
@@ -26,14 +26,14 @@ MAX_ROTATION_ERROR = 1e-3
 def reading_lines(path: Path, *, comments: bool = False) -> Iterator[Iterator[str]]:
     """Yield an iterator of the stripped lines that are not blank; ``comments`` drops # lines.
 
-    Errors of the block get file and line; a ValueError, as of ``float``, becomes a DataError.
+    Errors in the block get file and line; a ValueError (from ``float``) becomes a DataError.
     """
     texts = read_text(path).split("\n")
     number: int | None = None
 
     def lines() -> Iterator[str]:
         nonlocal number
-        for number, text in enumerate(texts, start=1):  # noqa: B007  of the message below
+        for number, text in enumerate(texts, start=1):  # noqa: B007  used in the message below
             if text.strip() and not (comments and text.strip().startswith("#")):
                 yield text.strip()
         number = None
@@ -95,8 +95,8 @@ _ROW = re.compile(
 class CameraList:
     """Cameras by the names of their images.
 
-    An image gets the row with the longest name that its path ends with, by whole folders; else the
-    only row whose name ends with the image's.
+    An image gets the row with the longest name that is the end of its path (whole folders), else
+    the only row whose name ends with the image name.
     """
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
@@ -106,7 +106,7 @@ class CameraList:
             self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
 
     def of(self, image: str, path: Path) -> Camera | None:
-        """Return the camera of an image by name and file; None without a row."""
+        """Return the camera of an image by name and file; None if no row matches."""
         names = self._by_file.get(PurePosixPath(image).name, [])
         file = path.absolute().as_posix()
         ending = [name for name in names if file.endswith(f"/{name}")]

@@ -106,7 +106,7 @@ class DatasetChoice:
         return settings
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        """Yield the files that an import depends on; of a download, all below its root."""
+        """Yield the files that an import depends on; for official datasets, all below the root."""
         return input_files(root) if self.adapter is None else files_below(root)
 
     def rehearse(self) -> None:
@@ -238,7 +238,7 @@ def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
     )
     if adapter is None:
         raise OptionError(
-            f"dataset {name} needs --root, a folder with mapping/, query/ and perhaps query_gt/"
+            f"dataset {name} needs --root, a folder with mapping/, query/ and optionally query_gt/"
             + looked
         )
     card = adapter.card
@@ -258,7 +258,7 @@ def twin_of(layout: str, **options: Any) -> RenderedDataset:
         "pip install megloc-twins",
     )
     if layout not in known:
-        raise OptionError(f"nothing renders {layout!r}; known: {', '.join(known)}")
+        raise OptionError(f"no renderer for {layout!r}; known: {', '.join(known)}")
     twin: RenderedDataset = load_plugin(RENDERED_DATASETS, layout, options)
     return twin
 
@@ -351,7 +351,7 @@ def _has_depth(root: Path) -> bool:
     has_depth = bool(depth_records(data))
     if data.records_depth and not has_depth:
         message = (
-            "%s: no rig joins the depth sensors to cameras of their moments; depth is not used"
+            "%s: no rig links depth sensors to cameras at the same timestamps; depth is not used"
         )
         _log.warning(message, root)
     return has_depth

@@ -228,7 +228,7 @@ def _insert(stages: list[Stage], stage: Stage) -> None:
     """Insert a plugin stage after the last stage that writes one of its inputs."""
     check_option(
         not any(stage.name == other.name for other in stages),
-        f"stages.{stage.name}: there is a stage of this name",
+        f"stages.{stage.name}: this stage name is already used",
     )
     for path in stage.reads:
         check_option(
@@ -248,7 +248,7 @@ def _with_model(run: Run) -> DatasetChoice:
     if source is None:
         raise OptionError(
             f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs its "
-            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
+            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' works without'
         )
     return source
 

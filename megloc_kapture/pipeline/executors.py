@@ -35,8 +35,8 @@ _before = ExitStack()  # restores the thread counts
 def single_threaded() -> Iterator[None]:
     """Limit BLAS, OpenMP and torch to one thread, as executors provide the parallelism.
 
-    The last bits of a product may depend on the number of threads. Blocks may overlap in several
-    threads.
+    The last bits of a product may depend on the number of threads. Several
+    threads may be in such a block at once.
     """
     global _num_blocks
     with _lock:
@@ -106,7 +106,7 @@ def open_executor(
     that all workers must see, the current one by default.
     """
     count = available_cores() if workers is None else workers
-    check_option(count >= 1, f"{count} workers cannot work; give 1 or more")
+    check_option(count >= 1, f"{count} workers: give 1 or more")
     if scheduler is not None and kind != "dask":
         raise OptionError("--scheduler needs --executor dask")
     if kind == "dask":

@@ -92,7 +92,7 @@ def export_colmap(scene: Scene, output: Path) -> None:
     names = [image.name for image in scene.images]
     if len(set(names)) != len(names):
         twice = min(name for name in names if names.count(name) > 1)
-        raise DataError(f"map and queries both have an image {twice!r}; COLMAP knows one")
+        raise DataError(f"image {twice!r} is in the map and the queries; COLMAP needs unique names")
     images = [MapImage(i.name, i.camera, i.cam_from_world, i.keypoints_px) for i in scene.images]
     observed = [(image.rows, image.points) for image in scene.images]
     write_model(output, images, observed, scene.points[:, :3], scene.points[:, 3:])
@@ -101,7 +101,7 @@ def export_colmap(scene: Scene, output: Path) -> None:
 def export_undistorted(scene: Scene, output: Path) -> None:
     """Write PINHOLE cameras, ``images/`` and ``sparse/0`` for Gaussian splatting.
 
-    ``/`` in image names becomes ``_``, as the original program ignores folders.
+    ``/`` in image names becomes ``_``, because the original program ignores folders.
     """
     images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
     for image in images:
@@ -164,7 +164,7 @@ def export_tum(scene: Scene, output: Path) -> None:
 def _exponent_of_seconds(timestamp: int) -> int:
     """Return the power of ten that converts a timestamp to seconds, recognised by its magnitude.
 
-    Nano-, micro- and milliseconds are since 1970; each limit is between 1973 and 5138.
+    Nano-, micro- and milliseconds count from 1970: the limits hold for dates from 1973 to 5138.
     """
     limits = ((10**17, -9), (10**14, -6), (10**11, -3))
     return next((exponent for limit, exponent in limits if timestamp >= limit), 0)
@@ -267,7 +267,7 @@ def export(
                 export_nerfstudio(scene, out, beside=output)
         return len(scene.images)
     if output.exists() and not force:
-        raise OutputError(f"{output}: is there already; --force overwrites it")
+        raise OutputError(f"{output}: exists; --force overwrites it")
     if name == "tum":
         export_tum(scene, output)
     else:

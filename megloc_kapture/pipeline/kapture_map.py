@@ -32,7 +32,7 @@ PixelOriginChoice = Literal["auto", "corner", "centre"]
 
 _SAMPLED_IMAGES = 50
 _NETWORKS = ("aliked", "aslfeat", "disk", "r2d2", "superpoint", "xfeat")
-# SIFT extractor by whether descriptors are bytes
+# SIFT extractors for float (False) and byte (True) descriptors
 _SIFT_OF = {True: "sift", False: "rootsift"}
 
 
@@ -78,7 +78,7 @@ class MapKeypoints:
         choice = next((choice for name in names if (choice := _extractor_named(name))), None)
         has_descriptors = self.name in self.folder.types("descriptors")
         if choice is not None and choice.name in _SIFT_OF.values() and has_descriptors:
-            # other tools also say SIFT; COLMAP's and OpenMVG's descriptors are bytes
+            # other tools also use the name SIFT; COLMAP's and OpenMVG's descriptors are bytes
             choice = PluginChoice(name=_SIFT_OF[self._descriptors.config.dtype.kind == "u"])
         return choice
 
@@ -139,7 +139,7 @@ class KaptureMap:
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
             origins = {
-                name: replace(origin, intrinsics=pixel_origin, reason="as asked for")
+                name: replace(origin, intrinsics=pixel_origin, reason="as requested")
                 for name, origin in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
@@ -218,7 +218,7 @@ class KaptureMap:
             run, number = 10, _SAMPLED_IMAGES // 10
             starts = np.linspace(0, max(len(images) - run, 0), number).astype(int).tolist()
             taken = sorted({at for start in starts for at in range(start, start + run)})
-            # half a pixel of pixel origin is well below the tolerated error
+            # a pixel origin off by half a pixel is well below the tolerated error
             sample = observed_keypoints(
                 self.folder, keypoints.index, (images[at] for at in taken if at < len(images))
             )
@@ -299,7 +299,7 @@ def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dic
             # only their difference is measured
             agree = origin.keypoints == origin.intrinsics
             keypoints = intrinsics if agree else origin.keypoints
-            reason = f"{origin.reason}; of the intrinsics {most} says {intrinsics}"
+            reason = f"{origin.reason}; intrinsics from {most}: {intrinsics}"
             origin = replace(origin, intrinsics=intrinsics, keypoints=keypoints, reason=reason)
         origins[name] = origin
     return origins

@@ -56,7 +56,7 @@ _NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32
 
 
 class LocalType:
-    """A keypoints type of the map with its query extraction and matching; plugins load lazily.
+    """A keypoints type of the map, with its extractor and matchers; plugins are loaded lazily.
 
     ``points`` observe the map's points; ``first`` is matched first and differs from ``points`` in
     guided pyramids. ``cache`` holds map features, shared with other types.
@@ -103,8 +103,8 @@ class LocalType:
             raise DataError(
                 f"features of type {self.name!r} are missing and no extractor for them is "
                 f"installed (known: {', '.join(plugin_names(LOCAL_FEATURES))}); give them with "
-                "--features-dir, or in the kapture folder; or, if one of the known ones made "
-                f"them, write its name first into {self.name}/keypoints.txt",
+                "--features-dir, or in the kapture folder; or, if a known extractor made "
+                f"them, write its name first in {self.name}/keypoints.txt",
                 path=self._map.folder.root,
             )
         extractor: LocalFeatureExtractor = load_chosen(
@@ -149,7 +149,7 @@ class LocalType:
         self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
     ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
         """Match the best map images with the second matcher, and those with few matches by guided
-        pyramid matching, as far as these are enabled.
+        pyramid matching, if these are enabled.
 
         Returns query keypoints with added ones last, matches in the order of ``pairs``, and the
         reason if the pyramid was skipped, else "".
@@ -198,7 +198,7 @@ class LocalType:
         stored = keypoints.keypoints_px(image)
         source = self if keypoints is self.first else keypoints
         descriptors = source.descriptors(image)
-        # keypoints without a point help no pose, but reject wrong matches in the mutual check
+        # keypoints without a point are kept: in the mutual check they reject wrong matches
         return Features.of(self._map.camera(image), stored, descriptors)
 
 
@@ -271,7 +271,7 @@ def extract_again(
 class _GlobalType:
     """Global features for comparison; ``choice`` is None if queries provide them.
 
-    ``extractor`` is None for VLAD and without weights, ``stored`` true if the map has vectors.
+    ``extractor`` is None for VLAD or missing weights; ``stored`` is true if the map has vectors.
     """
 
     name: str
@@ -292,8 +292,8 @@ class _GlobalType:
 class MapMatching:
     """Retrieval, matching and reranking of queries against a map; thread-safe.
 
-    Uses global features shared by map and query, else those of the options that the map has, else
-    describes map images in memory.
+    Retrieval uses global features that map and query share; else types in the options that the map
+    has; else global features of the map images are computed in memory.
     """
 
     def __init__(
@@ -316,7 +316,7 @@ class MapMatching:
     def candidates(self, image: QueryImage, features: Sequence[Features]) -> tuple[list[str], bool]:
         """Return the map images to match, and whether they are ranked, best first.
 
-        Those of a small map without global features are not.
+        The images of a small map without global features are all matched, unranked.
         """
         query = image.query
         if query.candidates is not None:
@@ -348,7 +348,7 @@ class MapMatching:
         ]
 
     def rerank(self, matches: Sequence[Sequence[VerifiedMatches]]) -> list[int]:
-        """Return the rows of the images that stay, best first; all if reranking is off."""
+        """Return the rows of the images to keep, best first; all if reranking is off."""
         how = self.options.reranking
         numbers = [
             [counted(pair, how.by) for pair in of_type]
@@ -360,7 +360,7 @@ class MapMatching:
     @cached_property
     def _counted_types(self) -> Sequence[str]:
         names = [local.name for local in self.types]
-        # a foreign map may lack the types of the preset
+        # a map of another tool may lack the types of the preset
         return self.options.reranking.types_named(names) or names
 
     def _permitted(self, query: Query) -> list[str]:
@@ -372,7 +372,7 @@ class MapMatching:
         unknown = set(images) - self._known_images
         if unknown:
             raise DataError(
-                f"query {query.name} is to be matched with {min(unknown)}, which is no image of "
+                f"query {query.name} has the candidate {min(unknown)}, which is not an image of "
                 "the map",
                 path=self._map.folder.root,
             )
@@ -447,7 +447,7 @@ class MapMatching:
             if local_type in (None, settings.local_type):
                 return name
         name = vlad_type(local_type or base_type(self.types[0].name))
-        return name if name not in self._map.global_types() else f"{name}, trained anew"
+        return name if name not in self._map.global_types() else f"{name}, newly trained"
 
     @cached_property
     def _stored_vocabularies(self) -> dict[str, tuple[Vocabulary, VladSettings]]:
@@ -497,7 +497,7 @@ class MapMatching:
             )
         require(
             self._map.has_images(),
-            f"the map has no global features {kind.name!r}, and no images to describe",
+            f"the map has no global features {kind.name!r}, and no images to compute them from",
             path=self._map.folder.root,
         )
         extractor = kind.extractor or kind.choice.make(self.options.placement)
@@ -546,7 +546,7 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class LiveSource:
-    """Matches of one camera, computed with as many candidates as are asked for.
+    """Matches of one camera, computed for the requested number of candidates.
 
     Reranking, a second matcher and guided pyramids need the matches with all candidates first.
     """
@@ -574,7 +574,7 @@ class LiveSource:
         return view.among(self.candidates[:count])
 
     def _match(self, count: int) -> QueryView:
-        """Match the first ``count`` ranked images, as far as they are not matched yet."""
+        """Match those of the first ``count`` ranked images that are not matched yet."""
         self.clock.start()
         images, types = self._ranked[:count], self._matching.types
         num_matched = min(map(len, self._matches), default=0)

@@ -267,7 +267,7 @@ def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
         shown = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
         lines.append(f"not in the map: {shown}: {reason}")
     if missing:
-        lines.append(f"all of them: {tables / UNREGISTERED_FILE}")
+        lines.append(f"full list: {tables / UNREGISTERED_FILE}")
     world = read_world(tables)
     if world.unit == NO_METRES:
         hint = "--scale gps sets the scale" if len(photographs.gps()) >= MIN_IMAGES else ""
@@ -288,7 +288,7 @@ def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
 
 
 _STAMP = "colmap.txt"
-_VERSION = 3  # of the import; another version rebuilds all maps
+_VERSION = 3  # version of the import; a change rebuilds all maps
 
 
 def colmap_maps_folder() -> Path:

@@ -43,7 +43,7 @@ from megloc_kapture.values import Options
 
 PARTIAL = ".partial"
 LOCK = ".lock"
-MARK = ".fingerprint"  # in the unfinished folder of a stage that resumes
+MARK = ".fingerprint"  # in the unfinished output folder of a stage that resumes
 _MAP = "map"
 
 
@@ -244,13 +244,11 @@ def run_plan(
     asked = _with_followers(stages, first) if first else {}
     for name in names[:start]:
         if workspace.manifest(name) is None:
-            raise OptionError(
-                f"--from {first} needs stage {name}, which has not run; leave --from out"
-            )
+            raise OptionError(f"--from {first} needs stage {name}, which has not run; omit --from")
     for stage in stages:
         _check_root(stage, workspace)
     if not dry_run:
-        # an interrupted run leaves the request to the next run
+        # first, so that an interrupted run does not forget the request
         for name in asked:
             workspace.manifest_path(name).unlink(missing_ok=True)
             remove(workspace.partial_path(name))
@@ -305,7 +303,7 @@ class _Due:
             return _NOT_DONE
         gone = [output for output in made.outputs if not workspace.path(output).exists()]
         if gone:
-            return f"{gone[0]} is gone"
+            return f"{gone[0]} is missing"
         if before := self.former_outputs():
             return f"{before[0]} is no longer written"
         if made.fingerprint == self.mark:
@@ -313,7 +311,7 @@ class _Due:
         if made.version != self.stage.version:
             return "a newer version of the stage"
         changed = _differences(made.inputs, self.inputs)
-        # prefer the changed option to the changed plugin code
+        # report a changed option rather than changed plugin code
         read = [name for name in changed if not name.startswith(CODE_OF)]
         settings = json.loads(json.dumps(self.settings))  # converts tuples to lists
         options = _differences(made.options, settings)
@@ -356,7 +354,7 @@ def _check_root(stage: Stage, workspace: Workspace) -> None:
         return
     if stage.root is None or str(stage.root.resolve()) != held:
         raise OptionError(
-            f"{workspace.root} was made of {held}; give another folder for "
+            f"{workspace.root} was made from {held}; give another folder for "
             f"{stage.root or 'other data'}, or --force to replace its content"
         )
 
@@ -428,7 +426,7 @@ def describe(report: StageReport) -> str:
     if report.state == "kept":
         return f"{report.name}: up to date"
     if report.state == "skipped":
-        return f"{report.name}: taken as it is"
+        return f"{report.name}: used as is"
     if report.state == "pending":
         return f"{report.name}: would run ({report.why})"
     counts = ", ".join(count_text(*count) for count in report.counts.items())

@@ -40,7 +40,7 @@ from megloc_kapture.values import Options
 
 OptionsT = TypeVar("OptionsT", bound=Options)
 
-# the paper as printed; benchmarks/*.toml have the dataset-dependent steps (masks,
+# the paper as published; benchmarks/*.toml add its dataset-dependent steps (masks,
 # co-visibility, sequences, indoor weights), see docs/paper.md
 _MEGLOC = PipelineOptions(
     # undistorted cameras are unchanged; enlarging: docs/experiments/preprocessing.md
@@ -49,7 +49,7 @@ _MEGLOC = PipelineOptions(
         LocalFeaturesChoice(name="superpoint", matching=PluginChoice(name="superglue")),
         LocalFeaturesChoice(
             name="aslfeat",
-            # ASLFeat's authors' matcher; the paper names none
+            # matcher of ASLFeat's authors; the paper does not specify one
             matching=PluginChoice(name="nn", options={"max_ratio": 0.8}),
         ),
     ),
@@ -94,7 +94,7 @@ PRESETS: dict[str, PipelineOptions] = {
 }
 DEFAULT_PRESET = "classic"
 
-# the options that people change
+# the most commonly changed options
 BASIC_OPTIONS = (
     "device",
     "preprocessing.max_size_px",
@@ -115,9 +115,9 @@ def options_of_preset(
     changes: Sequence[dict[str, Any]] = (),
     assignments: Sequence[str] | Mapping[str, Any] = (),
 ) -> PipelineOptions:
-    """Return a preset's options with changes: nested tables in order, then the user's.
+    """Return a preset's options, modified by ``changes`` (nested tables) and ``assignments``.
 
-    ``assignments`` are ``key.key=value`` texts, or ``key.key`` to values.
+    Assignments are ``key.key=value`` texts or map ``key.key`` to values; they take precedence.
     """
     if preset not in PRESETS:
         raise OptionError(f"unknown preset {preset!r}; {suggestion(preset, PRESETS)}")
@@ -153,7 +153,7 @@ def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
 def assigned(
     assignments: Sequence[str] | Mapping[str, Any], *, flag: str = "--set"
 ) -> dict[str, Any]:
-    """Return nested tables of ``key.key=value`` texts, or of ``key.key`` to values."""
+    """Convert ``key.key=value`` texts, or a mapping of ``key.key`` to values, to nested tables."""
     tree: dict[str, Any] = {}
     typed = partial(_typed, flag=flag)
     pairs = assignments.items() if isinstance(assignments, Mapping) else map(typed, assignments)
@@ -169,7 +169,7 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
     key, equals, text = assignment.partition("=")
     check_option(equals and key, f"{flag} takes key=value, got {assignment!r}")
     key, text = key.strip(), text.strip()
-    if text in ("None", "null"):  # Options parses "none", which is also a choice of some options
+    if text in ("None", "null"):  # not "none": for some options it is a choice; Options parses it
         return key, None
     try:
         return key, tomllib.loads(f"value = {text}")["value"]
@@ -237,14 +237,14 @@ def _merged_choices(
         for name, change in changes.items():
             check_option(
                 isinstance(change, dict),
-                f"option {key}.{name}: a table is expected, got {change!r}",
+                f"option {key}.{name}: expected a table, got {change!r}",
             )
             _merge(named[name], change)
     elif len(merged) == 1:
         _merge(merged[0], changes)
     else:
         raise OptionError(
-            f"option {key}.{min(changes)}: there are several, name one of them: "
+            f"option {key}.{min(changes)}: there are several, choose one of: "
             f"{', '.join(f'{key}.{name}' for name in named)}"
         )
     return merged
@@ -264,7 +264,7 @@ def check_weights(options: PipelineOptions) -> None:
         preset = max(fetching, key=lambda name: len(fetching[name]))
         free = all(lookup(name).commercial for name in fetching[preset])
         command = f"megloc weights fetch --preset {preset}{'' if free else ' --accept-licence'}"
-        message = f"{error}\nthe weights of preset {preset} are fetched together by: {command}"
+        message = f"{error}\nfetch all weights of preset {preset} with: {command}"
         error = MissingWeightsError(message, names=error.names)
     raise error
 

@@ -82,8 +82,8 @@ class Query:
         """Return the image as uint8 (H, W, 3) RGB."""
         if self.image is None:
             raise DataError(
-                f"query {self.name} has no image, and lacks features of the map's types or is to "
-                "be looked at"
+                f"query {self.name} needs an image: features of the map's types are missing, or a "
+                "step reads pixels"
             )
         if isinstance(self.image, str | Path):
             image = turned_upright(read_image_rgb(Path(self.image)), self.orientation)
@@ -108,8 +108,8 @@ class Preprocessor:
         masks = options.preprocessing.masks
         check_option(
             masks == MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic),
-            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images: "
-            "make one with `megloc preprocess`; a query brings its own mask: Query(mask=...)",
+            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images "
+            "(`megloc preprocess`); give the mask of a query as Query(mask=...)",
         )
 
     def of(self, query: Query) -> QueryImage:

@@ -67,8 +67,8 @@ _LIST_SUFFIXES = (".txt", ".csv")
 class Queries(ABC):
     """Query images, read one at a time.
 
-    ``unreadable`` and ``faults`` are reasons, by image name, why images or their features are
-    unusable; faults are filled during reading.
+    ``unreadable`` and ``faults`` give the reason, by image name, why an image or its features
+    are unusable; faults are filled during reading.
     """
 
     def __init__(self) -> None:
@@ -147,7 +147,7 @@ class KaptureQueries(Queries):
             plain = plain_name(base)
             serving = [name for name in brought if plain_name(base_type(name)) == plain]
             if serving and base not in self._local:
-                # a type serves its guided pyramid, and the other way round
+                # a type can replace its guided-pyramid type, and vice versa
                 name = min(serving, key=lambda name: (name != base, name != base_type(name), name))
                 self._local[base] = _StoredType(
                     folder.keypoints(name),
@@ -329,7 +329,7 @@ class Photographs(Queries):
     ) -> None:
         super().__init__()
         if every is not None and every < 1:
-            raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
+            raise OptionError(f"every {every}th frame cannot be used; give 1 or more")
         roots = [Path(path) for path in paths]
         files = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent
@@ -351,8 +351,8 @@ class Photographs(Queries):
         warn_of_scaled(roots[0], self._scaled)
         if self.names and self.without_row == self.names:
             raise OptionError(
-                f"the list of cameras has no row of any image, as of {self.names[0]}: its first "
-                "fields are names of images"
+                f"the list of cameras has none of the images, for example {self.names[0]}: the "
+                "first field of each row is an image name"
             )
 
     def known_cameras(self) -> bool:
@@ -464,7 +464,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         elif path.exists():
             require(
                 path.suffix.lower() not in _LIST_SUFFIXES,
-                "not an image; a list of cameras is given by --camera",
+                "not an image; give a list of cameras with --camera",
                 path=path,
             )
             files = {path.name: path}
@@ -473,8 +473,8 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         for name, file in files.items():
             if name in by_name:
                 raise DataError(
-                    f"{by_name[name]} has the same name below the folder that was given; give the "
-                    "folder that holds both",
+                    f"{by_name[name]} has the same path relative to its given folder; give a "
+                    "common parent folder",
                     path=file,
                 )
             _check_name(name, file)

@@ -46,7 +46,7 @@ class Results(Mapping[str, Pose | Failure]):
         candidates: Candidates | None = None,
         track: Track = untracked,
     ) -> None:
-        check_option(workers >= 1, f"{workers} workers cannot work; give 1 or more")
+        check_option(workers >= 1, f"{workers} workers: give 1 or more")
         self.localizer = localizer
         self.queries: Queries
         if isinstance(folder, Photographs):

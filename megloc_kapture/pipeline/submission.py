@@ -56,7 +56,7 @@ _log = logging.getLogger(__name__)
 
 _Content = tuple[Mapping[str, str], Sequence[str], Sequence[tuple[str, str]]]
 _Results = Mapping[str, LocalizationResult]
-"""Results by image, with the poses that are handed in, fallbacks included."""
+"""Results by image, with the submitted poses, including fallbacks."""
 
 
 def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
@@ -66,13 +66,13 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
     wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
     if tables is None and wanted not in plain:
         raise OptionError(
-            f"the rules of {dataset} are in the megloc/ folder of its import, which is missing "
-            "here; give it to submit with --side-tables, to check with --data"
+            f"the rules of {dataset} are in the megloc/ folder of the imported dataset, which is "
+            "missing; give it with --side-tables (submit) or --data (check)"
         )
     official = {name for name in dataset_names() if name not in plain}
     check_option(
         wanted == given or wanted in plain and given not in official,
-        f"dataset {dataset} is asked for, and {(tables or Path()) / PROTOCOL_FILE} is of "
+        f"dataset {dataset} was requested, but {(tables or Path()) / PROTOCOL_FILE} is for "
         f"dataset {protocol.dataset}",
     )
 
@@ -93,15 +93,15 @@ def write_submission(
     Parameters
     ----------
     place : the file; for MLAD a folder with one file per relocalization file.
-    tables : the workspace's ``megloc/`` folder; None means no query list, no rules, one frame.
+    tables : the workspace's ``megloc/`` folder; without it, all queries count, in the map frame.
     provenance : entries for the provenance (dataset, preset, options).
     from_rig : derive missing poses from the rig.
 
     Returns
     -------
-    Counts: ``queries``; ``scored`` images, or rows of MLAD; their ``poses`` and ``missing``;
-    ``doubtful`` among the missing (low confidence); ``fallbacks`` (guesses) and ``from_rig`` among
-    the poses; ``dummies``, rows without a pose.
+    Counts: ``queries``; ``scored`` images (MLAD: rows), split into ``poses`` and ``missing``;
+    missing due to low confidence (``doubtful``); poses guessed by retrieval (``fallbacks``) or
+    derived ``from_rig``; and MLAD rows with a placeholder pose (``dummies``).
     """
     beside = None if tables is None else tables.parent
     rules = Protocol() if tables is None else read_protocol(tables)
@@ -146,13 +146,13 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
     data = localized_data
     query = None if beside is None else beside / QUERY
     if query is not None and (query / "sensors" / "sensors.txt").is_file():
-        # includes the rig, and queries missing from a foreign result
+        # has the rig, and queries that the result of another program may lack
         data = KaptureFolder(query).read()
         strange = set(localized_data.image_names()) - set(data.image_names())
         if strange:
             raise DataError(
-                f"image {min(strange)!r} is not among the queries of {query}: is the result of "
-                "this dataset?",
+                f"image {min(strange)!r} is not among the queries of {query}: does the result "
+                "belong to this dataset?",
                 path=localized,
             )
     path, poses = localized / STATUS_FILE, localized_data.poses()
@@ -164,7 +164,7 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
     if from_rig:
         require(
             data.rigs,
-            "no pose can come from the rig: neither the queries nor the result have a rigs.txt",
+            "poses cannot be derived from the rig: neither queries nor result have a rigs.txt",
             path=localized,
         )
         # from the camera with the most inliers; fallback poses are replaced, never propagated
@@ -202,7 +202,7 @@ def _ltvl(
     rule = rules.pose_file_names
     unnamed = [] if names else [i for i in posed if not is_name(name_by_rule(i, rule))]
     if unnamed:
-        message = "%d images have no row in the pose file, whose names hold no white space: %s%s"
+        message = "%d images are left out: names in a pose file cannot contain white space: %s%s"
         more = ", ..." if len(unnamed) > 1 else ""
         _log.warning(message, len(unnamed), repr(unnamed[0]), more)
         posed = sorted(set(posed) - set(unnamed))
@@ -213,11 +213,11 @@ def _ltvl(
 
 
 def _mlad(results: _Results, tables: Path) -> _Content:
-    """Return texts by file name, (row, image) with a pose, and those without."""
+    """Return texts by file name, the query of each row with a pose, and rows without one."""
     pairs = read_relocalization(tables)
     require(
         pairs,
-        "no pairs, and an MLAD challenge is about pairs: was the dataset imported with its "
+        "no pairs, which an MLAD challenge needs: was the dataset imported with its "
         "relocalization files?",
         path=tables / RELOCALIZATION_FILE,
     )
@@ -230,7 +230,7 @@ def _mlad(results: _Results, tables: Path) -> _Content:
         query, reference = poses.get(pair.query), references.get(pair.reference)
         if query is None or reference is None:
             missing.append((f"{pair.file}: {pair.reference} {pair.query}", pair.query))
-            pose = RigidTransform.identity()  # as kapture's exporter writes it
+            pose = RigidTransform.identity()  # same as kapture's exporter
         else:
             posed.append(pair.query)
             pose = relative_pose(query, reference, scale=scale)
@@ -293,12 +293,12 @@ FOLDER = "submissions"
 def keep_submission(place: Path, folder: Path) -> Path:
     """Copy a submission and its provenance into a folder of submissions; return the copy's path.
 
-    Identical content is not copied again; a name conflict gets a number, ``..._METHOD-2.txt``.
+    Identical content is not copied again; name conflicts are numbered, ``..._METHOD-2.txt``.
     """
     for path in (place, provenance_path(place)):
-        require(path.exists(), "no such file; --from submission writes it again", path=path)
+        require(path.exists(), "no such file; --from submission rewrites it", path=path)
     provenance = json.loads(read_text(provenance_path(place)))
-    # a dot in a folder's name starts no suffix
+    # folders have no suffix, even with a dot in their name
     suffix = place.suffix if place.is_file() else ""
     for number in count(1):
         numbered = "" if number == 1 else f"-{number}"

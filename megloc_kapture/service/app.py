@@ -171,7 +171,7 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
     known = read_camera(camera)
     require(
         (known.width, known.height) == (width, height),
-        f"the image is {width}x{height} as it is stored, its camera says "
+        f"the image is {width}x{height} as it is stored, its camera expects "
         f"{known.width}x{known.height}",
     )
     return ImageQuery(known, pixels, name)
@@ -324,6 +324,6 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
 
     @app.exception_handler(Exception)
     async def fail(_: Request, __: Exception) -> Response:
-        return JSONResponse({"error": "internal error; the service's log says more"}, 500)
+        return JSONResponse({"error": "internal error; see the service's log"}, 500)
 
     return app

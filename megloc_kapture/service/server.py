@@ -49,7 +49,7 @@ def bind(host: str, port: int) -> socket.socket:
 def serve(service: Service, bound: socket.socket, *, log_requests: bool = False) -> None:
     """Serve until SIGTERM or SIGINT, which takes effect after running requests have finished."""
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
-    cv2.setNumThreads(1)  # the threads are for images
+    cv2.setNumThreads(1)  # images are localized in parallel instead
     app = make_app(service, map_overview(service.localizer.map))
     config = uvicorn.Config(
         app,

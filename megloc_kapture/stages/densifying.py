@@ -245,7 +245,7 @@ def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDA
 
 
 _NO_POINTS = np.zeros(0, np.int64)
-_ANCHOR_VIEWS = 2  # that must agree with a keypoint's depth before it is lifted
+_ANCHOR_VIEWS = 2  # views that must agree with a keypoint's depth before it is lifted
 # keypoint noise in image pixels under exact poses; excess is attributed to the poses
 _KEYPOINT_ERROR_PX = 0.3
 # target median pose error in depth-map pixels; tolerated difference of views, in multiples of
@@ -253,7 +253,7 @@ _KEYPOINT_ERROR_PX = 0.3
 # views have absorbed half of the variance
 _ERROR_PX, _DIFFERENCE, _DEVIATION = 0.5, 5.0, 2 / 1.1774
 
-# map images an image is compared with; more where poses are not exact
+# number of source images of an image; more where poses are not exact
 _NUM_SOURCES, _MAX_SOURCES = 4, 16
 
 
@@ -445,7 +445,7 @@ def _plan(
             images[other] for other in chosen if source.image_path(images[other]).is_file()
         )
         if limits is None or not sources:
-            reason = "too few points in sight" if limits is None else "no image shares points"
+            reason = "too few visible points" if limits is None else "no image shares points"
             rows.append(replace(blank, reason=reason))
             continue
         lifts = indices if options.mode == "points" else ()
@@ -473,7 +473,7 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
 
 
 def _estimate(job: _Job) -> str:
-    """Estimate one image's depth into the scratch folder; return why it failed, or ""."""
+    """Estimate one image's depth into the scratch folder; return "" or why it failed."""
     folder, size = job.folder.open(), job.fit.max_size_px
     try:
         views = [_view(folder, image, size) for image in (job.image, *job.sources)]

@@ -285,7 +285,7 @@ def _describe(
 
 
 class ExtractGlobalFeatures(PipelineStage):
-    """Describe every image by the vectors that retrieval compares."""
+    """Extract global features of all images for retrieval."""
 
     name = "global_features"
     version = 2

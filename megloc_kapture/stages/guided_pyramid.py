@@ -1,4 +1,4 @@
-"""Pairs matched again by stronger means: a second matcher, then guided pyramids (MegLoc).
+"""Repeated matching of pairs by a second matcher, then by guided pyramids (MegLoc).
 
 The second matcher matches the best pairs of each image; guided pyramids match poor pairs at other
 scales and rotations.
@@ -162,7 +162,7 @@ def _tried(pair: tuple[str, str], before: int, combined: Combined, skipped: str)
 
 
 def _sums(local_type: str, tried: Sequence[TriedPair]) -> dict[str, float]:
-    """Warn of skipped variants, and return sums for the log."""
+    """Warn about skipped variants, and return sums for the log."""
     if skipped := Counter(pair.skipped for pair in tried if pair.skipped):
         message = "guided pyramid of %s: variants of %d pairs are skipped, most often %s"
         _log.warning(message, local_type, skipped.total(), skipped.most_common(1)[0][0])

@@ -302,7 +302,7 @@ def _most_similar(
     index, similarity = retrieval.rank(vectors, vectors, top_k + 1)
     rows = np.repeat(np.arange(len(index)), index.shape[1])
     both = np.stack([rows, index.ravel()], axis=1)
-    # the image ranks among its own results, not always first if it has duplicates
+    # an image is among its own results, but not always first if it has duplicates
     others = both[:, 0] != both[:, 1]
     rank = np.cumsum(others.reshape(index.shape), axis=1).ravel()
     keep = others & (rank <= top_k) & (both[:, 1] >= 0)

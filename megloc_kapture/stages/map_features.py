@@ -45,9 +45,9 @@ def move_points(
     moved, rows_of, num_found = _moved(model, mapping, seen)
     require(
         num_found >= _MIN_FOUND_AGAIN * len(seen),
-        f"the model has no descriptors, and of its {len(seen)} observations only "
-        f"{num_found / len(seen):.0%} have a keypoint that extracting {local_type} again "
-        "finds: it was made with another detector, other options or other images",
+        f"the model has no descriptors, and extracting {local_type} again finds keypoints "
+        f"of only {num_found / len(seen):.0%} of its {len(seen)} observations: it "
+        "was made with another detector, other options or other images",
         path=model.root,
     )
     none = np.zeros(0, np.int64)

@@ -57,7 +57,7 @@ def triangulate_map(
     matches : folder of the verified matches.
     local_types : keypoints types; duplicates are ignored.
     pairs : restrict the matches to these pairs.
-    num_threads : of COLMAP.
+    num_threads : threads of COLMAP.
     """
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
@@ -90,7 +90,7 @@ def triangulate_map(
         raise DataError(
             f"no point could be triangulated: {sum(map(len, of_type.values()))} of the image pairs "
             "have verified matches. Check that the images overlap, and that their poses "
-            "(cam_from_world) and cameras are right",
+            "(cam_from_world) and cameras are correct",
             path=mapping.root,
         )
     _write_map(mapping, output, xyz, observations)
@@ -163,7 +163,7 @@ def lift_map(
     with_depth = [image for image in images if image in records]
     require(
         with_depth,
-        "no mapping image has a pose and a depth map of its moment (records_depth.txt, a "
+        "no mapping image has a pose and a depth map with its timestamp (records_depth.txt, a "
         "rig with camera and depth sensor)",
         path=mapping.root,
     )

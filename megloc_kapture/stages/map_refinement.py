@@ -114,7 +114,7 @@ class MapSelection:
         return observed, rows
 
     def covariances(self) -> Floats:
-        """Covariances (N, 6) from the kept observations; NaN where undetermined."""
+        """Return covariances (N, 6) from the kept observations; NaN where undetermined."""
         if self._covariances is None:
             observed, _ = self.observed()
             self._covariances = point_covariances(

@@ -63,8 +63,8 @@ from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
 
-CACHED_IMAGES = 80  # per process: about 250 MB of RootSIFT
-_PAIRS_PER_ITEM = 32  # share an image, whose features are read once
+CACHED_IMAGES = 80  # in each process; about 250 MB of RootSIFT
+_PAIRS_PER_ITEM = 32  # pairs of one image, whose features are read once
 # image groups in which the given poses are checked against the matches
 _CHECKED_GROUPS = 6
 _RANKS = (0, 1, 3, 7, 15)  # ranks of the other group members among the images paired with the first
@@ -75,7 +75,7 @@ Verification = KnownPoseOptions | TwoViewOptions | None
 
 
 class SecondMatchingOptions(Options):
-    """Second pass of matching: the best pairs again, with another matcher."""
+    """Second pass of matching: the best pairs are matched again by another matcher."""
 
     matcher: PluginChoice | None = Field(
         default=None,
@@ -84,7 +84,7 @@ class SecondMatchingOptions(Options):
     pairs: int = Field(
         default=5,
         gt=0,
-        description="pairs of each query and each map image, those with most verified matches",
+        description="pairs of each query and each map image, those with the most verified matches",
     )
 
 
@@ -113,7 +113,7 @@ class Features(ImageFeatures):
 
 
 Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
-"""Select the right ones, bool (K,), of the matches (K, 2) of two images, best first."""
+"""Selects the correct matches, bool (K,), among those of two images, (K, 2), best first."""
 
 
 _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
@@ -180,9 +180,9 @@ def match_pairs(
 def best_pairs(
     verified: Mapping[tuple[str, str], int], number: int, *, of_both: bool
 ) -> list[tuple[str, str]]:
-    """Return the ``number`` pairs with most verified matches of each first image, sorted.
+    """Return the ``number`` pairs with the most verified matches of each first image, sorted.
 
-    With ``of_both`` also those of each second image. Ties are in order of the names.
+    With ``of_both`` also those of each second image. Ties are broken by name.
     """
     chosen: set[tuple[str, str]] = set()
     taken: Counter[str] = Counter()
@@ -392,7 +392,7 @@ EXPLAINED = ("map", *MATCHING_OPTIONS)
 
 
 def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
-    """Read the pairs of map images, without photographs that got no pose."""
+    """Read the pairs of map images, without those of unregistered photographs."""
     names = set(mapping.read().image_names())
     return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
 
@@ -432,7 +432,7 @@ class MatchMapping(PipelineStage):
 
 
 class MatchQueries(PipelineStage):
-    """Match and verify queries with their candidates, before reranking with all of them."""
+    """Match queries with their candidates and verify the matches."""
 
     name = "query_matches"
     version = 4

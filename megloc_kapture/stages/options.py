@@ -45,7 +45,7 @@ class LocalFeaturesChoice(PluginChoice):
     """A local feature extractor, its options, and the matching of its features."""
 
     matching: PluginChoice | None = Field(
-        default=None, description="matcher of this type; none: the run's"
+        default=None, description="matcher of this type; none: option matching of the run"
     )
 
 
@@ -79,7 +79,7 @@ class PipelineOptions(Options):
     query_pairs: QueryPairsOptions = QueryPairsOptions()
     reranking: RerankingOptions = RerankingOptions()
     matching: PluginChoice = Field(
-        default=PluginChoice(name="nn"), description="matcher of feature types that name none"
+        default=PluginChoice(name="nn"), description="matcher of feature types without their own"
     )
     verification: Literal["geometric", "mapping", "none"] = Field(
         default="geometric",
@@ -147,7 +147,7 @@ class PipelineOptions(Options):
         """Return the keypoints types used for localization, VLAD's type first."""
         types = [extractor.name for extractor in self.make_extractors()]
         if twice := _first_twice(types):
-            raise OptionError(f"keypoints type {twice!r} is asked for twice in local_features")
+            raise OptionError(f"keypoints type {twice!r} is listed twice in local_features")
         return types
 
     def main_type(self) -> str:
@@ -159,7 +159,7 @@ class PipelineOptions(Options):
         main_type = self.main_type()
         types = [chosen.type_name(main_type) for chosen in self.global_features]
         if twice := _first_twice(types):
-            raise OptionError(f"global features {twice!r} are asked for twice")
+            raise OptionError(f"global features {twice!r} are listed twice")
         weights = tuple(chosen.weight for chosen in self.global_features)
         return Retrieval(tuple(types), weights, self.fusion)
 

@@ -61,7 +61,7 @@ from megloc_kapture.values import Camera, LocalizationResult, Options, Pose, Rig
 
 # map images held out at once; a larger window wastes work after the last one needed
 _WINDOW = 4
-# map images a refiner may choose from: the nearest that look the query's way
+# map images a refiner may choose from: the nearest with a similar viewing direction
 _MAX_REFERENCES = 30
 
 
@@ -98,9 +98,9 @@ class MapRefiners:
     ) -> None:
         if options.refines() and unit_of(mapping.root) != METRES:
             raise OptionError(
-                f"pose_refinement.by {options.by[0].name}: its limits are in metres, and the map's "
-                "scale is not known; `megloc map --scale` makes a map in metres, `megloc import "
-                "colmap --unit m` says that a COLMAP model is in metres"
+                f"pose_refinement.by {options.by[0].name}: its limits are in metres, but the map's "
+                "scale is unknown; `megloc map --scale` makes a map in metres, `megloc import "
+                "colmap --unit m` declares that a COLMAP model is in metres"
             )
         self.refiners = tuple(options.make_refiners(placement))
         self.map = FolderSpec(mapping)
@@ -147,13 +147,13 @@ class MapRefiners:
         ]
 
     def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return ``references`` and ``distrusted`` for :func:`apply_refiners`, frame tested."""
+        """Test the frame; return ``references`` and ``distrusted`` for :func:`apply_refiners`."""
         frame = self._frame(pose)
         near = self._by_frame[frame].near(
             pose.cam_from_world,
             pose.candidates,
             max_references=_MAX_REFERENCES,
-            # a pose made elsewhere comes from no cluster
+            # a pose of another program has no cluster
             only_first=bool(pose.candidates),
         )
         return tuple(near), tuple(
@@ -190,8 +190,8 @@ def apply_refiners(
 ) -> Pose:
     """Apply several refiners to the pose of one query; return the last accepted pose.
 
-    ``references`` are map images that may overlap with the query, best first. ``distrusted`` has a
-    reason not to use a refiner, or "", for each.
+    ``references`` are map images that may overlap with the query, best first. ``distrusted`` has,
+    for each refiner, the reason not to use it, or "".
     """
     steps, seconds = [], dict(pose.seconds)
     for refiner, reason in zip(refiners, distrusted, strict=True):
@@ -282,7 +282,7 @@ def refine_poses(
 
 
 def _read_results(localized: KaptureFolder) -> dict[str, LocalizationResult]:
-    """Read results by name: poses of localized queries with covariances, others by their status."""
+    """Read results by name; localized queries become poses with covariances."""
     results = read_status(localized.root / STATUS_FILE)
     table = localized.root / COVARIANCE_FILE
     covariances = read_covariances(table) if table.is_file() else {}

@@ -56,7 +56,7 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options
 
-# median motion of keypoints 0.03 px, and a third of the size of PNG
+# keypoints move by 0.03 px (median); files have a third of the size of PNG
 JPEG_QUALITY = 98
 
 Mask = NDArray[np.bool_]
@@ -194,7 +194,7 @@ class ClassMasks:
 def find_unchanging_regions(
     folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
 ) -> dict[str, UnchangingRegion]:
-    """Find the static region of each camera, by sensor id; without one it is false, with a reason.
+    """Find the static region of each camera, by sensor id; it is falsy if there is none.
 
     ``sequences`` are folders with more images of these cameras: for queries, the map.
     """
@@ -395,7 +395,7 @@ def preprocess_images(
     for image_shares in results:
         num_masked += bool(image_shares)
         shares.update(image_shares)
-    remarks += [f"a fixed mask fits no image: {mask.camera}" for mask in standing.unused()]
+    remarks += [f"a fixed mask matches no image: {mask.camera}" for mask in standing.unused()]
     for remark in remarks:
         _log.warning("%s", remark)
     return {
@@ -418,7 +418,7 @@ def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> li
     """Report cameras without a static region; if all lack it, a fallback is required."""
     remarks = [f"camera {name}: {r.reason}" for name, r in sorted(regions.items()) if not r]
     if regions and not (have_fallback or any(region.frontier for region in regions.values())):
-        raise OptionError(f"no unchanging region can be found: {remarks[0]}")
+        raise OptionError(f"no static region is found: {remarks[0]}")
     return remarks
 
 

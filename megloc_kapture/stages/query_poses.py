@@ -329,7 +329,7 @@ class QuerySource(Protocol):
 
     @property
     def in_turn(self) -> bool:
-        """True if candidates are ranked, and a view of fewer takes less time."""
+        """True if candidates are ranked and matching fewer of them saves time."""
         ...
 
     def view(self, count: int) -> QueryView:
@@ -361,8 +361,8 @@ def localize_query(
     """Localize a query, or the cameras of a rig; return a result per camera.
 
     ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
-    With ``sure_confidence``, candidates that are not matched yet are taken in turn until the pose
-    is certain (docs/performance.md). See :func:`localize_unit`.
+    With ``sure_confidence``, candidates that are not matched yet are matched in turn until the
+    pose is certain (docs/performance.md). See :func:`localize_unit`.
     """
 
     def solve(count: int) -> list[Pose | Failure]:

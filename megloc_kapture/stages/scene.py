@@ -78,11 +78,11 @@ def observed_keypoints(
     data, keypoints = folder.read(), folder.keypoints(index.local_type)
     poses = data.poses()
     lifted = index.seen_once
-    telling = lifted if lifted[index.point_ids].all() else ~lifted
+    informative = lifted if lifted[index.point_ids].all() else ~lifted
     observed = []
     for image in images:
         rows, points = index.observed(image)
-        chosen = telling[points]
+        chosen = informative[points]
         pixels = keypoints.read(image)[:, :2]
         camera, pose = data.camera_of(image), poses[image]
         observed.append(
@@ -94,7 +94,7 @@ def observed_keypoints(
 def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
     """Add the median angle and distance between observations and points, from a sample of images.
 
-    Points lifted from the one keypoint that observes them give none, as they fit exactly.
+    Points lifted from a single keypoint are left out, because they fit it exactly.
     """
     if index.seen_once[index.point_ids].all() or index.local_type not in folder.types("keypoints"):
         return index

@@ -61,7 +61,7 @@ def count_text(name: str, value: float) -> str:
 # imported kapture folders
 MAPPING, QUERY, QUERY_GT, REFERENCE = "mapping", "query", "query_gt", "reference"
 PREPROCESSED = "preprocessed"
-POSED, PHOTOGRAPH_MATCHES = "posed", "matches/photographs"  # of photographs without poses
+POSED, PHOTOGRAPH_MATCHES = "posed", "matches/photographs"  # for photographs without poses
 LOCAL_FEATURES, GLOBAL_FEATURES = "local_features", "global_features"
 MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
 QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before reranking
@@ -123,7 +123,7 @@ class Layout:
 
 
 LayoutPath = str | Callable[[Layout], str | tuple[str, ...]]
-"""A path in the workspace, or the method of :class:`Layout` that gives it, or several."""
+"""A path in the workspace, or the method of :class:`Layout` that returns it, or several."""
 
 
 def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
@@ -153,7 +153,7 @@ class StageWork(Work):
         return KaptureFolder(self.path(name), features_dirs=[self.path(part) for part in features])
 
     def folders(self, names: Sequence[str], *features: str) -> list[KaptureFolder]:
-        """Open the existing ones of these kapture folders."""
+        """Open those of these kapture folders that exist."""
         return [self.folder(name, *features) for name in names if self.path(name).is_dir()]
 
 
@@ -167,7 +167,7 @@ def is_below(path: str, folder: str) -> bool:
 
 
 class Stage(ABC):
-    """One step of a run. A class says what it is in its attributes, or in properties.
+    """One step of a run. Subclasses describe it by attributes or properties.
 
     Attributes
     ----------

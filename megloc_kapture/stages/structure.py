@@ -66,7 +66,7 @@ class StructureOptions(Options):
 
 
 class MatchPhotographs(MatchMapping):
-    """Match photographs without poses; verified by a two-view model."""
+    """Match photographs without poses and verify the matches by a two-view model."""
 
     name = "photograph_matches"
     uses = (*MATCHING_OPTIONS, "query_verification")
@@ -77,7 +77,7 @@ class MatchPhotographs(MatchMapping):
 
 
 class FindPoses(PipelineStage):
-    """Find poses and cameras of matched photographs; of several models the largest is the map's."""
+    """Find poses and cameras of matched photographs; the largest model becomes the map."""
 
     name = "poses"
     version = 3
@@ -101,7 +101,7 @@ class FindPoses(PipelineStage):
             i for i, sensor in model.sensors.items() if sensor not in data.sensors
         ):
             message = (
-                "%d photographs have the size of others but another camera (a zoom, a crop): %s"
+                "%d photographs have the size of others but a different camera (zoom or crop): %s"
             )
             _log.warning(message, len(separate), ", ".join(separate))
         tables = work.out / SIDE_TABLES
@@ -134,8 +134,8 @@ class FindPoses(PipelineStage):
         photographs = []
         for image in images:
             sensor, px = data.record_of(image)[1], keypoints.read(image)[:, :2]
-            untold = data.sensors[sensor].name == ""
-            photographs.append(Photograph(image, sensor, data.camera_of(image), px, untold))
+            is_doubtful = data.sensors[sensor].name == ""
+            photographs.append(Photograph(image, sensor, data.camera_of(image), px, is_doubtful))
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
         putative = {(pair.image, pair.other): pair.matches for pair in counts}
         reader = mapping.matches(local_type)
@@ -170,7 +170,7 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
     for (timestamp, device), name in data.records_camera.items():
         if name in model.poses:
             sensor = model.sensors[name]
-            # the image got another camera
+            # an image with a different camera gets its own sensor
             own_sensor = (
                 sensor if sensor in data.sensors else f"{device}_{data.record_of(sensor)[0]}"
             )

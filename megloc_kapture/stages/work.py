@@ -1,4 +1,4 @@
-"""Context of a run: ordered work with bounded memory and a progress bar, batches of networks.
+"""Execution context: ordered work with bounded memory, a progress bar, and network batches.
 
 Work runs on an executor with one core per process. Networks on a GPU of this machine run in this
 process only: threads read ahead, one thread computes batches, and the executor does the rest.
@@ -79,19 +79,21 @@ def in_batches(
                 raise
             if len(batch) == 1:
                 raise MeglocError(
-                    f"{name(len(finished))}: there is not enough memory for it alone; make images "
+                    f"{name(len(finished))}: not enough memory, even without batching; make images "
                     "smaller (max_megapixels, preprocessing.max_size_px), keep fewer keypoints, or "
                     "compute on another device (--device)"
                 ) from error
             _limits[key] = len(batch) // 2
             continue
         if len(results) != len(batch):
-            raise PluginError(f"{many} of {key[0]} gave {len(results)} for {len(batch)} items")
+            raise PluginError(
+                f"{many} of {key[0]} returned {len(results)} results for {len(batch)} items"
+            )
         finished += results
     return finished
 
 
-# of plain RuntimeErrors: allocation by the CPU, by CUDA contexts, cuBLAS and cuDNN
+# messages of plain RuntimeErrors from the CPU allocator, CUDA contexts, cuBLAS and cuDNN
 _OUT_OF_MEMORY = (
     "can't allocate memory",
     "out of memory",
@@ -103,7 +105,7 @@ _OUT_OF_MEMORY = (
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether torch ran out of memory, on any device and in any library below it."""
+    """Return whether torch ran out of memory, on any device and in any underlying library."""
     torch: Any = sys.modules.get("torch")
     if torch is None or not isinstance(error, RuntimeError):
         return False
@@ -146,7 +148,7 @@ def ordered_map(
         while waiting:
             yield waiting.popleft().result()
     except GeneratorExit:
-        # not on errors: a breaking pool fails on futures that were cancelled meanwhile
+        # not on errors: a pool that is breaking fails on cancelled futures
         for future in waiting:
             future.cancel()
         raise
@@ -160,12 +162,12 @@ def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
 
 @dataclass(frozen=True)
 class Batched(Generic[Item, Result]):
-    """A function of several items, in module-level steps, so that plugins get batches.
+    """A function on batches of items, split into picklable steps.
 
     Attributes
     ----------
     read : reads the arrays of an item.
-    compute : a result per item, by ``plugin``, whose batch method is ``many``.
+    compute : returns one result per item, using ``plugin`` with batch method ``many``.
     alike : consecutive items with equal keys share a batch; None means single items.
     finish : optional last step for an item and its result; needs no device.
     """

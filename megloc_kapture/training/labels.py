@@ -20,7 +20,7 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
 UNMATCHED, IGNORED = -1, -2
-# glue-factory's distances: matched keypoints are nearer in both images, unmatched ones are farther
+# glue-factory's thresholds: matched keypoints are nearer in both images, unmatched ones are farther
 # from all keypoints of the other image
 POSITIVE_PX, NEGATIVE_PX = 3.0, 5.0
 # largest relative depth difference of a visible point
@@ -119,7 +119,7 @@ def reproject(
 
 
 def overlap(a: PosedView, b: PosedView) -> float:
-    """Return the share of pixels with depth visible in the other image, the smaller of two."""
+    """Return the smaller of the two shares of pixels with depth that the other image sees."""
     shares = []
     for view, other in ((a, b), (b, a)):
         size = view.camera.width, view.camera.height

@@ -113,7 +113,7 @@ class XFeatDescriber(nn.Module):
         super().__init__()
         name = extractor.options.descriptor_weights or extractor.options.weights
         network: Any = load_xfeat(read_weights(find_weights(name)), name)
-        # as in inference, faster on a processor
+        # as in inference, faster on a CPU
         self._network = network.to(memory_format=torch.channels_last)
         self.net = network.net
         for part in (self.net.heatmap_head, self.net.keypoint_head, self.net.fine_matcher):
@@ -140,7 +140,7 @@ def describer_of(extractor: LocalFeatureExtractor) -> SuperPointDescriber | XFea
 
 
 class ProductHead(nn.Module):
-    """Matching by products of descriptors, with a learned scale and dustbin for training only."""
+    """Matching by dot products of descriptors, with learned scale and dustbin for training only."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -252,8 +252,8 @@ def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor
 class HeldOutResult:
     pairs: int
     loss: float  # mean over the pairs
-    precision: float  # share of right matches of labelled keypoints
-    recall: float  # share of the labelled matches
+    precision: float  # correct share of the matches of labelled keypoints
+    recall: float  # share of the labelled matches that are found
     # area under the curve of the relative pose error up to 5, 10 and 20 degrees, in [0, 1]
     auc: tuple[float, ...]
 
@@ -277,7 +277,7 @@ def held_out_result(model: PairModel, pairs: Sequence[PreparedPair]) -> HeldOutR
 def judged(
     matches: NDArray[np.int64], labels: Labels
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks (K,) of right matches and of matches with a label."""
+    """Return masks (K,) of correct matches and of matches with a label."""
     a, b = labels.partner_a[matches[:, 0]], labels.partner_b[matches[:, 1]]
     return a == matches[:, 1], (a != IGNORED) | (b != IGNORED)
 
@@ -286,8 +286,8 @@ def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
     """Return the larger error of rotation and translation direction in degrees; infinite without a
     pose.
 
-    The translation's sign is ignored, as in SuperGlue's evaluation, and the translation for views
-    of one centre.
+    As in SuperGlue's evaluation, the sign of the translation is ignored, and without a baseline
+    the translation.
     """
     views, truth = pair.pair.views, pair.pair.b_from_a
     assert views is not None and truth is not None

@@ -68,7 +68,9 @@ class TrainingOptions(NetworkOptions):
     steps: int = Field(default=100_000, gt=0)
     pairs_per_step: int = Field(default=16, gt=0, description="number of pairs per batch")
     learning_rate: float = Field(
-        default=1e-4, gt=0, description="of Adam, for half of the steps; then decays to 1 %"
+        default=1e-4,
+        gt=0,
+        description="learning rate of Adam for half of the steps; then decays to 1 %",
     )
     layers: int = Field(
         default=18,
@@ -76,7 +78,9 @@ class TrainingOptions(NetworkOptions):
         multiple_of=2,
         description="number of attention layers, alternating self and cross",
     )
-    sinkhorn_iterations: int = Field(default=50, gt=0, description="in training and evaluation")
+    sinkhorn_iterations: int = Field(
+        default=50, gt=0, description="iterations in training and evaluation"
+    )
     matcher_weights: str | None = Field(
         default=None, description="initial SuperGlue; none: random weights"
     )
@@ -94,7 +98,7 @@ class DescriptorOptions(TrainingOptions):
 
     through: Literal["superglue", "products"] = Field(
         default="superglue",
-        description="superglue: trained with it, as MegLoc; products: for nearest neighbours",
+        description="superglue: with SuperGlue, as in MegLoc; products: for nearest neighbours",
     )
 
 
@@ -178,7 +182,7 @@ class Trainer:
         }
 
     def evaluate(self) -> list[float]:
-        """Return COLUMNS from the fourth on, means over the held-out sources; NaN without any."""
+        """Return the fourth and later COLUMNS: means over held-out sources, NaN without these."""
         self.model.eval()
         self.results = {
             name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
@@ -242,15 +246,15 @@ def train(
 
     Each evaluation writes ``output`` (``X.safetensors``), for descriptors trained through SuperGlue
     also ``X-superglue.safetensors``, the manifest ``X.json``, the curves ``X.csv`` and
-    ``X.state.pt``, from which the same call resumes; ``X.overlaps`` is written before. Returns the
-    last row of the curves.
+    ``X.state.pt``, from which the same call resumes. ``X.overlaps`` caches the overlap of image
+    pairs. Returns the last row of the curves.
 
     Parameters
     ----------
     kaptures, held_out : with poses and depth; ``held_out`` for evaluation only.
     photographs : folders of images, for homographies.
     force : replace another training's files.
-    threads : prepare pairs.
+    threads : number of threads that prepare pairs.
     """
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
@@ -308,7 +312,7 @@ def _check_same_training(output: Path, record: Mapping[str, Any]) -> None:
     except (DataError, ValueError, AttributeError):
         known = None
     if known is None:
-        raise OutputError(f"{output}: was not written by a training; -f replaces it")
+        raise OutputError(f"{output}: not the output of a training; -f replaces it")
     if known != record:
         changed = sorted(k for k in {*known, *record} if known.get(k) != record.get(k))
         raise OutputError(
@@ -332,6 +336,6 @@ def _write(trainer: Trainer, output: Path, record: Mapping[str, Any]) -> None:
     results = {name: asdict(result) for name, result in trainer.results.items()}
     manifest = {"training": record, "step": trainer.step, "held_out": results}
     write_json(output.with_suffix(".json"), manifest)
-    # last: a state means that the other files are complete
+    # written last: if the state exists, the other files are complete
     progress = {"step": trainer.step, "rows": trainer.rows}
     write_bytes(output.with_suffix(".state.pt"), state_bytes(model, trainer.optimizer, progress))

@@ -176,7 +176,7 @@ def test_from_uses_files_of_another_tool_as_they_are(
     (workspace / "pairs" / "query.txt").write_text("".join(rows))
     done = evaluate(scene, workspace, "--from", "query_matches", "--until", "localization")
     assert ran(done.err) == list(STAGES[7:9])
-    assert set(map(states(done.err).get, STAGES[:6])) == {"taken as it is"}
+    assert set(map(states(done.err).get, STAGES[:6])) == {"used as is"}
     statuses = read_status(workspace / "localized" / "status.csv")
     candidates = {query: (image,) for query, image in nearest.items()}
     assert {query: status.candidates for query, status in statuses.items()} == candidates
@@ -213,7 +213,7 @@ def test_failed_queries_are_misses_and_a_rejected_stranger_is_correct(
     failed = {name: s.reason for name, s in statuses.items() if s.status == "failed"}
     assert set(failed) == {"0004.jpg", "0007.jpg", "0010.jpg", "stranger.png"}
     assert failed["0007.jpg"].startswith("the image cannot be used: ")
-    assert "200x100, its camera says 400x300" in failed["0007.jpg"]
+    assert "200x100, its camera expects 400x300" in failed["0007.jpg"]
     text = " ".join((run / "evaluation" / "recall.txt").read_text().split())
     assert "1 query shows nothing of the map: 1 refused, 0 given a pose" in text
     # the localized query has the same pose as without the failed ones

@@ -156,7 +156,7 @@ def test_a_submission_of_relocalization_pairs_is_a_folder(megloc: Any, tmp_path:
     write_relocalization_dataset(root)
     command = ["submit", "4seasons", "-i", root / "localized", "-o", place]
     done = megloc(*command)
-    assert done.out == f"3 poses of 4 queries, 1 missing, dummies in their place: {place}\n"
+    assert done.out == f"3 poses of 4 queries, 1 missing, written as dummy poses: {place}\n"
     assert {path.name for path in tmp_path.glob("submission*")} == {place.name, "submission.json"}
     assert [path.name for path in place.iterdir()] == ["a_to_b.txt"]
     megloc(*command).refused("exists; -f")

@@ -43,7 +43,7 @@ def test_the_content_and_possible_uses_of_a_foreign_map_are_listed(
     # the few images are all matched; global features of queries need missing weights
     every = f"all {images} map images"
     assert listed["retrieval"] == f"{every}, not ranked"
-    ranked = f"where queries bring AP-GeM-LM18: {every}, ranked by global features AP-GeM-LM18"
+    ranked = f"if queries have AP-GeM-LM18: {every}, ranked by global features AP-GeM-LM18"
     assert ranked in done.out
     errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
     assert errors is not None

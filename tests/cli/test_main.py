@@ -28,7 +28,7 @@ WRONG_ARGUMENTS = {
     "not a number": (["eval", "--workers", "two"], "Error parsing --workers: "),
     "not a choice": (["eval", "-v", "loud"], "invalid choice 'loud'"),
     "too many": (["info", "a", "b"], "Unrecognized options: b"),
-    "value out of range": (["serve", "map", "--max-mb", "0"], "--max-mb 0.0: give more than 0"),
+    "value out of range": (["serve", "map", "--max-mb", "0"], "--max-mb 0.0: must be positive"),
 }
 
 

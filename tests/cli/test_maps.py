@@ -98,7 +98,7 @@ def test_a_refined_foreign_map_loses_uncertain_points_and_is_localized_in(
         assert counts[name] == (len(folder.points3d()), observations)
     left, given = (set(map(tuple, folder.points3d().tolist())) for folder in (new, old))
     assert left < given
-    assert re.search(r"known of \d+ points", printed)
+    assert re.search(r"known for \d+ points", printed)
     assert len(kapture_from_dir(str(refined)).points3d) == len(new.points3d())
     command = ("localize", "-i", refined, "--query", foreign_map / "query")
     done = megloc(*command, "-o", tmp_path / "poses")
@@ -125,7 +125,7 @@ def test_poses_without_depth_are_kept_with_the_reason(
 @pytest.mark.parametrize(
     ("by", "message"),
     [
-        ((), "no pose refiner is chosen; --by takes: field, icp, rendering"),
+        ((), "no pose refiner is chosen; give --by: field, icp, rendering"),
         (("--by", "magic"), "no plugin 'magic' in .*; registered: field, icp, rendering"),
         (("--by", "field"), "train-field"),
     ],

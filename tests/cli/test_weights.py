@@ -128,7 +128,7 @@ def test_a_restricted_licence_needs_consent_before_any_download(megloc: Any, fol
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        ((), "say which weights to fetch: free, bound"),
+        ((), "choose weights to fetch: free, bound"),
         (("fre",), "no weights 'fre' in the registry; did you mean 'free'\\? there are"),
         (
             ("by-hand",),
@@ -171,7 +171,7 @@ def test_added_files_are_listed_and_checked(megloc: Any, folder: Path, tmp_path:
     megloc("weights", "add", source).refused("say what it is with --name")
     done = megloc("weights", "add", source, "--name", "by-hand")
     assert done.out.startswith(f"by-hand: {folder}/by-hand.pth (loads; sha256 ")
-    assert megloc("weights", "check").out.endswith("no file is wrong\n")
+    assert megloc("weights", "check").out.endswith("all files are correct\n")
     rows = [line.split() for line in megloc("weights", "list").out.splitlines()]
     states = {row[0]: row[-2:] for row in rows[1:5]}
     assert states["free"] == ["there", "known"] and states["bound"] == ["missing", "known"]

@@ -248,7 +248,7 @@ def test_ambiguous_and_missing_models_are_refused(room: Path) -> None:
 
 def test_without_features_or_images_the_import_is_refused(room: Path, tmp_path: Path) -> None:
     source, output = replace(find_colmap(room), database=None), tmp_path / "map"
-    with pytest.raises(DataError, match="no descriptors .*--database.* or the images .*--images"):
+    with pytest.raises(DataError, match="no descriptors .*--database.* or images .*--images"):
         import_colmap(ColmapFolders(source.model, None, None), output)
     (room / "images" / "0003.jpg").unlink()
     message = "images: 1 of the model's 7 images are not here, .* 0003"
@@ -289,7 +289,7 @@ def test_cameras_and_keypoints_are_scaled_to_smaller_images(
     )
     halved.validate(deep=True)
     Image.new("RGB", (50, 50)).save(room / "images" / name)
-    with pytest.raises(DataError, match=f"{room}.*{name}.*50x50, its camera says.*--images"):
+    with pytest.raises(DataError, match=f"{room}.*{name}.*50x50, its camera expects.*--images"):
         imported(find_colmap(room), tmp_path / "third")
 
 

@@ -64,7 +64,7 @@ def test_truth_is_optional_and_may_have_other_images(
 ) -> None:
     write_part(root, "query_gt", ["b/q.png", "s.png"], poses=True, images=False)
     assert import_kapture_folders(root, tmp_path / "a")["queries_with_truth"] == 1
-    assert "query_gt: true poses of 1 images that are no query" in caplog.text
+    assert "query_gt: true poses of 1 images that are not queries" in caplog.text
     (root / "query_gt/sensors/sensors.txt").unlink()
     assert import_kapture_folders(root, tmp_path / "b")["queries_with_truth"] == 0
     assert not (tmp_path / "b" / "query_gt").exists()

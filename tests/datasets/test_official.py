@@ -78,7 +78,7 @@ def test_missing_files_are_summarised_by_folder(dataset: OfficialDataset, tmp_pa
         assert not missing.require(root / "images" / name)
     message = (
         r"official: 4 files are missing: images/lists/night\.txt, images/night/1\.jpg and 2 more "
-        r"in its folder; --allow-missing imports what is there$"
+        r"in its folder; --allow-missing imports the rest$"
     )
     with pytest.raises(DataError, match=message):
         write_official(replace(dataset, missing=missing), tmp_path / "out")
@@ -116,4 +116,6 @@ def test_additional_truth_is_converted_to_the_local_frame(
     back = world.pose_in_official(poses.poses()["q/1.jpg"])
     np.testing.assert_allclose(back.center(), POSE.center(), atol=1e-6)
     np.testing.assert_allclose(back.quat_wxyz, POSE.quat_wxyz, atol=1e-12)
-    assert "true poses of 1 images that are no query are left out, the first is q/2" in caplog.text
+    assert (
+        "true poses of 1 images that are not queries are left out, the first is q/2" in caplog.text
+    )

@@ -137,7 +137,7 @@ def test_a_recentred_map(check: Check) -> None:
     assert not check(lines_of(poses), recentred).findings
     forgotten = {name: world.pose_in_local(pose) for name, pose in poses.items()}
     error = only(check(lines_of(forgotten), recentred))
-    assert error.kind == "far" and "another frame, or another scale" in error.message
+    assert error.kind == "far" and "another frame or scale" in error.message
 
 
 def test_single_poses_that_are_far(check: Check) -> None:
@@ -208,7 +208,7 @@ def test_names_with_one_systematic_error(
 def test_endings_and_cameras_of_robotcar(check: Check) -> None:
     names = [name.replace(".jpg", ".png") for name in ROBOTCAR]
     (finding,) = named(check, names, ROBOTCAR, "robotcar")
-    assert finding.severity == "warning" and "takes either" in finding.message
+    assert finding.severity == "warning" and "accepts either" in finding.message
     names = [*ROBOTCAR, *(name.replace("rear", "left") for name in ROBOTCAR)]
     (finding,) = named(check, names, ROBOTCAR, "robotcar")
     assert (finding.severity, finding.kind, len(finding.names)) == ("note", "not-scored", 6)

@@ -103,7 +103,7 @@ def test_the_challenge_s_list_gives_names_and_order() -> None:
         (RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, math.inf, 0.0)), "not finite"),
         (RigidTransform((math.nan, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "not finite"),
         (RigidTransform((0.9, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "length 0.9"),
-        (None, "pair 1 2 has no pose; MLAD wants every row"),
+        (None, "pair 1 2 has no pose; MLAD requires every row"),
     ],
 )
 def test_invalid_poses_are_not_written(

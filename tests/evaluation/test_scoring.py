@@ -105,7 +105,7 @@ def test_outcomes_and_reasons_from_statuses() -> None:
         ("localized", "", 5),
         ("fallback", "dark", None),
         ("missing", "blurred", None),
-        ("missing", "status says localized, but the result has no pose", None),
+        ("missing", "the status is localized, but the result has no pose", None),
         ("missing", "no pose in the result", None),
     ]
 

@@ -78,7 +78,7 @@ def test_keypoints_and_intrinsics_of_the_foreign_map_have_centred_pixels(
     assert (origin.intrinsics, origin.keypoints) == ("centre", "centre")
     assert origin.error_px["centre"] < 0.9 * origin.error_px["corner"]
     chosen = KaptureMap.open(virtual_gallery / "map", pixel_origin="corner").pixel_origin
-    assert (chosen.intrinsics, chosen.reason) == ("corner", "as asked for")
+    assert (chosen.intrinsics, chosen.reason) == ("corner", "as requested")
 
 
 def test_queries_have_the_origin_of_their_map(workspace: Path, map_copy: Path, scene: Path) -> None:

@@ -130,7 +130,7 @@ CHANGES: dict[str, tuple[Callable[[Plan], Any], list[str]]] = {
     ),
     "a removed output": (
         lambda plan: plan.workspace.path("a.txt").unlink(),
-        ["a.txt is gone", "", ""],
+        ["a.txt is missing", "", ""],
     ),
     "no manifest": (
         lambda plan: plan.workspace.manifest_path("b").unlink(),
@@ -229,7 +229,7 @@ def test_a_workspace_keeps_the_data_of_its_root(tmp_path: Path) -> None:
     for root in roots:
         root.mkdir(parents=True)
     assert import_from(first) == str(first)
-    with pytest.raises(OptionError, match=f"was made of {first}; give another folder"):
+    with pytest.raises(OptionError, match=f"was made from {first}; give another folder"):
         import_from(other)
     assert import_from(other, force=True) == str(other)
     other.rename(tmp_path / "moved")  # the only data that can be meant

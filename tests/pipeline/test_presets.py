@@ -79,7 +79,7 @@ SEVERAL = 'local_features=["sift", "rootsift"]'
         (["local_features=[]"], "local_features: .*at least 1 item"),
         (
             [SEVERAL, "local_features.options.max_keypoints=7"],
-            r"name one of them: local_features\.sift, local_f",
+            r"choose one of: local_features\.sift, local_f",
         ),
     ],
 )
@@ -120,9 +120,9 @@ def test_local_features_are_a_name_or_a_list(
 
 
 def test_repeated_types_are_refused() -> None:
-    with pytest.raises(OptionError, match="global features 'vlad_rootsift' are asked for twice"):
+    with pytest.raises(OptionError, match="global features 'vlad_rootsift' are listed twice"):
         options_of_preset(assignments=['global_features=["vlad","vlad"]']).retrieval()
-    with pytest.raises(OptionError, match="'sift' is asked for twice"):
+    with pytest.raises(OptionError, match="'sift' is listed twice"):
         options_of_preset(assignments=['local_features=["sift", "sift"]']).local_types()
 
 

@@ -80,7 +80,7 @@ def test_rotated_photographs_are_turned_without_a_given_camera(tmp_path: Path) -
     photos = Photographs([tmp_path], camera)
     assert photos.names == ["1.jpg"]
     assert photos.query("1.jpg").read_image().shape == (48, 64, 3)
-    assert photos.unreadable == {"2.jpg": "the image is 32x48, its camera says 64x48"}
+    assert photos.unreadable == {"2.jpg": "the image is 32x48, its camera expects 64x48"}
     photos = Photographs([tmp_path])
     assert photos.query("1.jpg").read_image().shape == (64, 48, 3)
     photos.write_images(tmp_path / "out")
@@ -119,7 +119,7 @@ def test_unusable_folders_are_refused(tmp_path: Path) -> None:
         ([one, two], "same name"),
         ([tmp_path / "nowhere"], "no such file"),
         ([tmp_path / "empty"], "no image or video"),
-        ([tmp_path / "cameras.txt"], "a list of cameras is given by --camera"),
+        ([tmp_path / "cameras.txt"], "give a list of cameras with --camera"),
     ):
         with pytest.raises(DataError, match=message):
             Photographs(paths)
@@ -146,7 +146,7 @@ def test_a_list_has_the_camera_of_each_image(tmp_path: Path) -> None:
     assert not photos.known_cameras()
     # the path distinguishes images of one name
     assert Photographs([tmp_path / "query" / "day"], cameras).query("1.jpg").camera.params[0] == 51
-    with pytest.raises(OptionError, match=r"no row of any image, as of 3\.jpg"):
+    with pytest.raises(OptionError, match=r"none of the images, for example 3\.jpg"):
         Photographs([tmp_path / "query" / "other"], cameras)
     # COLMAP's cameras.txt with one camera
     (tmp_path / "cameras.txt").write_text("# Camera list\n1 PINHOLE 64 48 50 50 32 24\n")
@@ -276,7 +276,7 @@ def test_cameras_are_scaled_to_smaller_images(
     write_image(folder.image_path(names[0]), np.zeros((50, 50, 3), np.uint8))
     found = KaptureQueries(folder, opened)
     found.check()
-    assert "50x50, its camera says" in found.unreadable[names[0]]
+    assert "50x50, its camera expects" in found.unreadable[names[0]]
 
 
 def test_other_spellings_of_a_type_are_recognised(

@@ -137,7 +137,7 @@ def test_names_with_white_space_are_left_out(
     counts = write_submission(tmp_path / "localized", place, tables=None, provenance={})
     assert list(read_pose_file(place)) == ["f.jpg"]
     assert (counts["scored"], counts["poses"], counts["missing"]) == (3, 1, 2)
-    assert "2 images have no row in the pose file" in caplog.text and "'a b.jpg'" in caplog.text
+    assert "2 images are left out" in caplog.text and "'a b.jpg'" in caplog.text
 
 
 def test_doubtful_queries_are_counted(dataset: Dataset, tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_inconsistent_results_are_refused(dataset: Dataset, tmp_path: Path) -> N
     place = tmp_path / "poses.txt"
     dataset.localize(dataset.query.image_names(), {})
     write_sensors(dataset.root / "query", replace(dataset.query, rigs={}))
-    with pytest.raises(DataError, match="no pose can come from the rig"):
+    with pytest.raises(DataError, match="poses cannot be derived from the rig"):
         submit(dataset, place, from_rig=True)
     write_protocol(dataset.tables, Protocol(dataset="robotcar", pose_file_names="basename"))
     write_groups(dataset.tables, {})
@@ -352,7 +352,11 @@ def test_provenance_has_the_weights_of_earlier_stages(dataset: Dataset, tmp_path
         ("aachen", "synthetic-aachen", None),
         ("synthetic", "kapture", None),
         ("kapture", "my-own-scene", None),
-        ("aachen", "robotcar", r"aachen is asked for, and .*protocol\.json is of dataset robotcar"),
+        (
+            "aachen",
+            "robotcar",
+            r"aachen was requested, but .*protocol\.json is for dataset robotcar",
+        ),
         ("kapture", "aachen", "of dataset aachen"),
         ("aahcen", "aachen", "unknown dataset 'aahcen'; did you mean 'aachen'. known: kapture, "),
     ],

@@ -145,10 +145,10 @@ def test_memory_that_runs_out_halves_the_batch(eight_at_once: None, frames: Any)
         assert plugin.seen == sizes
         plugin.seen.clear()
     none = Limited(most=0)
-    with pytest.raises(MeglocError, match=r"image 0\.jpg: there is not enough memory"):
+    with pytest.raises(MeglocError, match=r"image 0\.jpg: not enough memory"):
         extract_all(none, frames, NAMES)
     image = ImageFeatures(np.zeros((3, 2), np.float32), np.zeros((3, 4), np.float32), 8, 8)
-    with pytest.raises(MeglocError, match="pair 0, 1: there is not enough memory"):
+    with pytest.raises(MeglocError, match="pair 0, 1: not enough memory"):
         match_all(none, image, [image] * 3, ["pair 0, 1", "pair 0, 2", "pair 0, 3"])
     assert none.seen == [5, 2, 1, 2, 1]
 
@@ -159,7 +159,7 @@ def test_other_errors_are_not_retried(eight_at_once: None) -> None:
 
     with pytest.raises(RuntimeError, match="sizes do not agree"):
         batched(Limited(9), broken)
-    with pytest.raises(PluginError, match="match_many of Limited gave 0 for 5 items"):
+    with pytest.raises(PluginError, match="match_many of Limited returned 0 results for 5 items"):
         batched(Limited(9), lambda _: [])
 
 

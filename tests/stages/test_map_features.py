@@ -124,7 +124,7 @@ def test_observations_without_a_feature_are_left_out(world: Any, tmp_path: Path)
 def test_a_map_of_other_features_is_refused(world: Any, tmp_path: Path) -> None:
     reference = published(world.map(), tmp_path / "reference")
     some = with_fewer_features(world, tmp_path / "features", 100)
-    with pytest.raises(DataError, match=r"only \d+% have a keypoint that extracting rootsift"):
+    with pytest.raises(DataError, match=r"extracting rootsift again finds keypoints of only \d+%"):
         move_points(reference, some, TYPE, tmp_path / "map")
     assert not (tmp_path / "map").exists()
 

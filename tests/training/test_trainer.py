@@ -234,7 +234,7 @@ def test_invalid_training_is_refused(
     assert train(options(files, steps=4), output, **data, force=True)["step"] == 4
     mine = tmp_path / "mine.safetensors"
     mine.write_bytes(b"of somebody else")
-    with pytest.raises(OutputError, match="was not written by a training"):
+    with pytest.raises(OutputError, match="not the output of a training"):
         train(chosen, mine, **data)
     assert mine.read_bytes() == b"of somebody else"
     with pytest.raises(OptionError, match=r"256 dimensions; xfeat has 64"):
