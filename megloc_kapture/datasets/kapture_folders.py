@@ -168,7 +168,7 @@ def check_image_size(path: Path, camera: Camera) -> None:
 
 def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> DataError:
     return DataError(
-        f"the image is {size[0]}x{size[1]}, its camera expects {camera.width}x{camera.height}",
+        f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
         path=path,
     )
 

@@ -208,7 +208,7 @@ def _by_names_of_results(
     for result in results:
         if result.poses and not (true_poses.keys() | known) & set(result.images):
             raise DataError(
-                f"no image name matches: the result has {min(result.images)!r}, the truth "
+                f"no name fits: the result has {min(result.images)!r}, the truth "
                 f"{min(true_poses, default='nothing')!r}"
                 + (f" ({result.label})" if result.label else "")
             )

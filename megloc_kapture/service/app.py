@@ -171,7 +171,7 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
     known = read_camera(camera)
     require(
         (known.width, known.height) == (width, height),
-        f"the image is {width}x{height} as it is stored, its camera expects "
+        f"the image is {width}x{height} as it is stored, its camera says "
         f"{known.width}x{known.height}",
     )
     return ImageQuery(known, pixels, name)

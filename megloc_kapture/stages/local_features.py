@@ -153,7 +153,7 @@ def check_size(size: tuple[int, ...], camera: Camera, name: Path | str) -> None:
     """Raise DataError if an image size (width, height) differs from its camera's."""
     if size != (camera.width, camera.height):
         raise DataError(
-            f"the image is {size[0]}x{size[1]}, its camera expects {camera.width}x{camera.height}",
+            f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
             path=name,
         )
 

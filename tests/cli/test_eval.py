@@ -213,7 +213,7 @@ def test_failed_queries_are_misses_and_a_rejected_stranger_is_correct(
     failed = {name: s.reason for name, s in statuses.items() if s.status == "failed"}
     assert set(failed) == {"0004.jpg", "0007.jpg", "0010.jpg", "stranger.png"}
     assert failed["0007.jpg"].startswith("the image cannot be used: ")
-    assert "200x100, its camera expects 400x300" in failed["0007.jpg"]
+    assert "200x100, its camera says 400x300" in failed["0007.jpg"]
     text = " ".join((run / "evaluation" / "recall.txt").read_text().split())
     assert "1 query shows nothing of the map: 1 refused, 0 given a pose" in text
     # the localized query has the same pose as without the failed ones
@@ -229,6 +229,6 @@ def test_inverted_poses_are_refused_unless_forced(
     inverted = {key: pose.inverse() for key, pose in data.trajectories.items()}
     write_sensors(folder.root, replace(data, trajectories=inverted))
     done = evaluate(dataset, tmp_path / "ws", status=2)
-    assert "; poses inverted (camera-to-world, world_from_cam), " in done.err
+    assert "with poses inverted (camera-to-world, world_from_cam), " in done.err
     done = evaluate(dataset, tmp_path / "ws", "--force", "--until", "mapping_matches")
     assert "up to date" in done.err and "mapping_matches: " in done.err

@@ -289,7 +289,7 @@ def test_cameras_and_keypoints_are_scaled_to_smaller_images(
     )
     halved.validate(deep=True)
     Image.new("RGB", (50, 50)).save(room / "images" / name)
-    with pytest.raises(DataError, match=f"{room}.*{name}.*50x50, its camera expects.*--images"):
+    with pytest.raises(DataError, match=f"{room}.*{name}.*50x50, its camera says.*--images"):
         imported(find_colmap(room), tmp_path / "third")
 
 

@@ -235,9 +235,7 @@ def test_colmap_models_are_truth_and_result(
 
 def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) -> None:
     write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
-    with pytest.raises(
-        DataError, match="no image name matches: the result has 'other.jpg', the truth"
-    ):
+    with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
 
 

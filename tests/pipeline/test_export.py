@@ -168,5 +168,5 @@ def test_cameras_and_keypoints_are_scaled_to_smaller_images(map_copy: Path, tmp_
     np.testing.assert_allclose(xy, keypoints[:, :2] / 2, atol=1e-3)
     assert any("200x150, scaled from the 400x300" in text for text in describe_sizes(scaled.folder))
     write_image(records / name, np.zeros((50, 50, 3), np.uint8))
-    with pytest.raises(DataError, match=f"{name}: the image is 50x50, its camera expects"):
+    with pytest.raises(DataError, match=f"{name}: the image is 50x50, its camera says"):
         export("colmap", tmp_path / "refused", map=KaptureMap.open(map_copy))

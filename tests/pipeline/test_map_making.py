@@ -248,7 +248,7 @@ def test_photographs_without_a_common_scene_are_refused(room: Path, tmp_path: Pa
     assert not (tmp_path / "of_few").exists()
     wrong = Camera.pinhole(100, 512, 690.0)
     with pytest.raises(
-        DataError, match=r"0 photo.* \(2 more .* 0000.jpg: .*its camera expects 100x512"
+        DataError, match=r"0 photo.* \(2 more .* 0000.jpg: .*its camera says 100x512"
     ):
         megloc.map_photographs(tmp_path / "few", workspace=tmp_path / "wrong", camera=wrong)
 

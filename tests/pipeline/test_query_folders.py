@@ -80,7 +80,7 @@ def test_rotated_photographs_are_turned_without_a_given_camera(tmp_path: Path) -
     photos = Photographs([tmp_path], camera)
     assert photos.names == ["1.jpg"]
     assert photos.query("1.jpg").read_image().shape == (48, 64, 3)
-    assert photos.unreadable == {"2.jpg": "the image is 32x48, its camera expects 64x48"}
+    assert photos.unreadable == {"2.jpg": "the image is 32x48, its camera says 64x48"}
     photos = Photographs([tmp_path])
     assert photos.query("1.jpg").read_image().shape == (64, 48, 3)
     photos.write_images(tmp_path / "out")
@@ -116,7 +116,7 @@ def test_unusable_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24")
     for paths, message in (
-        ([one, two], "same name"),
+        ([one, two], "same path"),
         ([tmp_path / "nowhere"], "no such file"),
         ([tmp_path / "empty"], "no image or video"),
         ([tmp_path / "cameras.txt"], "give a list of cameras with --camera"),
@@ -276,7 +276,7 @@ def test_cameras_are_scaled_to_smaller_images(
     write_image(folder.image_path(names[0]), np.zeros((50, 50, 3), np.uint8))
     found = KaptureQueries(folder, opened)
     found.check()
-    assert "50x50, its camera expects" in found.unreadable[names[0]]
+    assert "50x50, its camera says" in found.unreadable[names[0]]
 
 
 def test_other_spellings_of_a_type_are_recognised(

@@ -355,9 +355,9 @@ def test_provenance_has_the_weights_of_earlier_stages(dataset: Dataset, tmp_path
         (
             "aachen",
             "robotcar",
-            r"aachen was requested, but .*protocol\.json is for dataset robotcar",
+            r"aachen was requested, but .* is for dataset robotcar",
         ),
-        ("kapture", "aachen", "of dataset aachen"),
+        ("kapture", "aachen", "for dataset aachen"),
         ("aahcen", "aachen", "unknown dataset 'aahcen'; did you mean 'aachen'. known: kapture, "),
     ],
 )

@@ -161,7 +161,7 @@ def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
         ("{", "camera: Invalid JSON"),
         ({"model": "FISHEYE"}, "unknown camera model 'FISHEYE'; known: "),
         ({"model": "RADIAL"}, "RADIAL takes 5 parameters, got 4"),
-        ({"width": 4000}, "the image is 400x300 as it is stored, its camera expects 4000x300"),
+        ({"width": 4000}, "the image is 400x300 as it is stored, its camera says 4000x300"),
         ({"width": "400"}, "camera.width"),
         ({"params": [float("nan")] * 4}, "camera"),
         ({"params": [-300, 300, 200, 150]}, "focal length"),

@@ -91,7 +91,7 @@ def test_damaged_inputs_are_refused(small_kapture: Any, tmp_path: Path) -> None:
     refused(r"a\.png", folder)
     camera = Camera("SIMPLE_PINHOLE", 320, 240, (300.0, 160.0, 120.0))
     larger = small_kapture({"a.png": noise()}, name="larger", camera=camera)
-    refused(r"a.png: the image is 160x120, its camera expects 320x240", larger)
+    refused(r"a.png: the image is 160x120, its camera says 320x240", larger)
 
 
 def features(count: int = 3, **changes: Any) -> LocalFeatures:

@@ -257,7 +257,7 @@ def break_inputs(street: KaptureFolder) -> dict[str, tuple[Path, bytes | None]]:
     return {
         "mask is 120x90, its image 320x200": (mask, small.read_bytes()),
         "broken": (image, image.read_bytes()[:-100]),
-        "image is 120x90, its camera expects 240x180": (image, small.read_bytes()),
+        "image is 120x90, its camera says 240x180": (image, small.read_bytes()),
         "no such image": (image, None),
     }
 
