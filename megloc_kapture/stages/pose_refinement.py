@@ -316,6 +316,9 @@ class RefinePoses(PipelineStage):
     inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
     outputs = (LOCALIZED, REFINEMENT_TIMING)
 
+    def explain(self) -> str:
+        return f"{super().explain()}, references = map images of the query's cluster"
+
     def is_wanted(self) -> bool:
         return self.options.pose_refinement.refines()
 

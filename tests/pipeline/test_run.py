@@ -48,11 +48,9 @@ def test_each_stage_has_a_reason() -> None:
     assert "localization.min_confidence = 0.0" in lines["localization"]["why"]
     changed = lines_of("aachen", "megloc", "guided_pyramid.mode=off")["query_pyramid"]
     assert not changed["on"] and changed["why"].startswith("guided_pyramid.mode = off")
-    assert lines_of("inloc", "megloc")["points"] == {
-        "name": "points",
-        "on": True,
-        "why": "map = lift",
-    }
+    inloc = lines_of("inloc", "megloc")
+    assert inloc["points"] == {"name": "points", "on": True, "why": "map = lift"}
+    assert inloc["refine_poses"]["why"].endswith("references = map images of the query's cluster")
 
 
 def test_data_without_a_model_have_no_pairs_by_covisibility(
