@@ -92,7 +92,7 @@ OUR_RULES_OUTDOORS = {
     "clusters ranked by distinctive inliers": ["localization.rank.name=distinctive"],
     "pairs by poses within 60 deg": ["mapping_pairs.poses.max_angle_deg=60"],
 }
-# minimum recall at the two finest thresholds of a dataset; dark conditions have none
+# minimum recall at the two finest thresholds of a dataset; dark conditions are not checked
 BARS = (0.90, 0.95)
 DARK = ("night", "night-rain", "night-all", "dusk", "all")
 SIZES = ("small", "images", "all")
