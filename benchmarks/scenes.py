@@ -54,9 +54,9 @@ def measure(scene: Path, seed: int, workspace: Path, arguments: Sequence[str]) -
     seeds = [part for key in SEEDED for part in ("--set", f"{key}={seed}")]
     if (scene / "map").is_dir():
         localized, report = workspace / f"localized-{seed}", workspace / f"evaluation-{seed}"
-        folders = ("-i", str(scene / "map"), "--query", str(scene / "query"), "-o", str(localized))
+        paths = ("-i", str(scene / "map"), "--query", str(scene / "query"), "-o", str(localized))
         benchmark = ("--set", "localization.sure_confidence=none")
-        megloc("localize", *folders, "-f", *benchmark, *seeds, *arguments)
+        megloc("localize", *paths, "-f", *benchmark, *seeds, *arguments)
         truth = ("--gt", str(scene / "query_gt"))
         megloc("evaluate", "-i", str(localized), *truth, "-o", str(report), "-f")
     else:
