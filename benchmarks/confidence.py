@@ -50,6 +50,7 @@ from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 MAX_ERROR, MAX_ANGLE_DEG = 0.1, 10.0
+ACCEPTED = 0.6  # minimum confidence of an accepted pose
 # terms that lower the confidence; the weights of all others are nonnegative
 NEGATIVE_TERMS = ("residual", "misfit", "deviation", "viewing_angle", "distance_ratio")
 # presets with a separate calibration, and its name: in blurred images SIFT has large residuals in
@@ -185,10 +186,10 @@ def is_right(pose: RigidTransform, truth: RigidTransform, localizer: Localizer) 
 # ------------------------------------------------------------------------------- calibration
 
 
-def fitted(table: pd.DataFrame, terms: Sequence[str], origin: str) -> confidence.Calibration:
+def fitted(table: pd.DataFrame, origin: str) -> confidence.Calibration:
     """Fit a regularised logistic model to the poses, with the sign of each weight constrained."""
     posed = table[table.localized]
-    values = posed[list(terms)].to_numpy(np.float64)
+    values = posed[list(TERMS)].to_numpy(np.float64)
     right = posed.right.to_numpy(np.float64)
     mean, spread = values.mean(axis=0), values.std(axis=0) + 1e-9
     scaled = (values - mean) / spread
@@ -200,11 +201,11 @@ def fitted(table: pd.DataFrame, terms: Sequence[str], origin: str) -> confidence
         value = np.mean(np.logaddexp(0, logits) - right * logits) + penalty @ parameters / 2
         return float(value), np.r_[excess.mean(), scaled.T @ excess / len(right)] + penalty
 
-    signs = [(None, 0.0) if term in NEGATIVE_TERMS else (0.0, None) for term in terms]
-    start = np.zeros(len(terms) + 1)
+    signs = [(None, 0.0) if term in NEGATIVE_TERMS else (0.0, None) for term in TERMS]
+    start = np.zeros(len(TERMS) + 1)
     solution = minimize(loss, start, jac=True, bounds=[(None, None), *signs], method="L-BFGS-B").x
     weights = solution[1:] / spread
-    kept = {t: round(float(w), 4) for t, w in zip(terms, weights, strict=True) if abs(w) > 1e-6}
+    kept = {t: round(float(w), 4) for t, w in zip(TERMS, weights, strict=True) if abs(w) > 1e-6}
     return confidence.Calibration(origin, round(float(solution[0] - weights @ mean), 4), kept)
 
 
@@ -217,7 +218,7 @@ def confidences(table: pd.DataFrame, model: confidence.Calibration) -> NDArray[n
     return probability
 
 
-def left_out(table: pd.DataFrame, terms: Sequence[str]) -> NDArray[np.float64]:
+def left_out(table: pd.DataFrame) -> NDArray[np.float64]:
     """Return leave-one-location-out confidences.
 
     The training rows contain neither queries nor negatives of the test location.
@@ -227,17 +228,17 @@ def left_out(table: pd.DataFrame, terms: Sequence[str]) -> NDArray[np.float64]:
     for held_out in sorted(set(locations)):
         test = (locations == held_out).to_numpy()
         negatives = (table.kind == f"of {held_out}").to_numpy()
-        model = fitted(table[~test & ~negatives], terms, "")
+        model = fitted(table[~test & ~negatives], "")
         scores[test] = confidences(table[test], model)
     return scores
 
 
-def cross_validated(table: pd.DataFrame, terms: Sequence[str]) -> NDArray[np.float64]:
+def cross_validated(table: pd.DataFrame) -> NDArray[np.float64]:
     """Cross-validate with a separate calibration for each preset that has one."""
-    scores = left_out(table, terms)
+    scores = left_out(table)
     for preset in PRESET_CALIBRATIONS:
         rows = (table.preset == preset).to_numpy()
-        scores[rows] = left_out(table[rows].reset_index(drop=True), terms)
+        scores[rows] = left_out(table[rows].reset_index(drop=True))
     return scores
 
 
@@ -261,11 +262,11 @@ def summary(table: pd.DataFrame, scores: NDArray[np.float64], accepted: float) -
     }
 
 
-def report(table: pd.DataFrame, scores: NDArray[np.float64], accepted: float) -> None:
+def report(table: pd.DataFrame, scores: NDArray[np.float64]) -> None:
     """Print accepted and rejected poses, the calibration and the wrong poses that are accepted."""
     inliers = np.where(table.localized, 1.0, np.nan)
     lines = {"12 inliers": summary(table, inliers, 0.5)}
-    lines[f"confidence {accepted:g}"] = summary(table, scores, accepted)
+    lines[f"confidence {ACCEPTED:g}"] = summary(table, scores, ACCEPTED)
     print(pd.DataFrame(lines).T.to_string())
     posed = table.localized.to_numpy()
     right = table.right.to_numpy()[posed]
@@ -280,7 +281,7 @@ def report(table: pd.DataFrame, scores: NDArray[np.float64], accepted: float) ->
         bounds = f"{entry.low:.1f}-{entry.high:.1f}"
         print(f"  {bounds}: {entry.num_poses:5d} poses, {entry.share_right:.2f} correct")
     table = table.assign(confidence=scores)
-    missed = table[posed & (table.confidence >= accepted) & ~table.right]
+    missed = table[posed & (table.confidence >= ACCEPTED) & ~table.right]
     print(
         missed.groupby(["scene", "kind"]).size().to_string()
         if len(missed)
@@ -313,7 +314,7 @@ def main() -> None:
         "collect", help="localize in each scene and write a table of poses"
     )
     collecting.add_argument("--scene", type=Path, action="append", required=True)
-    collecting.add_argument("--map", action="append", help="localize in the maps of these only")
+    collecting.add_argument("--map", action="append", help="use only the maps of these scenes")
     collecting.add_argument("--unrelated", type=Path)
     collecting.add_argument("--preset", default="classic")
     collecting.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -321,8 +322,6 @@ def main() -> None:
     collecting.add_argument("-o", "--output", type=Path, required=True)
     fitting = commands.add_parser("fit", help="evaluate, and with --write store, a calibration")
     fitting.add_argument("tables", type=Path, nargs="+")
-    fitting.add_argument("--terms", nargs="+", choices=list(TERMS), default=list(TERMS))
-    fitting.add_argument("--accepted", type=float, default=0.6)
     fitting.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.command == "collect":
@@ -330,22 +329,22 @@ def main() -> None:
         for scene in options.scene:
             if options.map and scene.name not in options.map:
                 continue
-            chosen = options.unrelated, options.preset, options.most, options.set
-            parts.append(collect(scene, options.scene, *chosen))
+            settings = options.unrelated, options.preset, options.most, options.set
+            parts.append(collect(scene, options.scene, *settings))
             pd.concat(parts).to_csv(options.output, index=False)
             print(f"{scene.name}: {len(parts[-1])} queries, {parts[-1].localized.sum()} poses")
         return
     everything = pd.concat([pd.read_csv(path) for path in options.tables], ignore_index=True)
-    scores = cross_validated(everything, options.terms)
+    scores = cross_validated(everything)
     for name, table in (("all", everything), *everything.groupby("preset")):
         print(f"\n{name}: {len(table)} queries of {table.scene.nunique()} maps")
-        report(table, scores[table.index], options.accepted)
+        report(table, scores[table.index])
     fits = {confidence.OF_ALL: everything}
     fits |= {
         kind: everything[everything.preset == preset]
         for preset, kind in PRESET_CALIBRATIONS.items()
     }
-    models = {n: fitted(part, options.terms, origin_of(part)) for n, part in fits.items()}
+    models = {n: fitted(part, origin_of(part)) for n, part in fits.items()}
     print("", *models.items(), sep="\n")
     if options.write:
         write(models)

@@ -393,7 +393,7 @@ def row(label: str, results: dict[str, list[Result]]) -> list[str]:
     return cells
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--queries", type=int, default=50, help="queries per setting")
     parser.add_argument(
@@ -404,9 +404,8 @@ def main() -> int:
     )
     parser.add_argument("--matches", type=int, default=2000, help="2D-3D matches per query")
     parser.add_argument("--inliers", type=float, nargs="+", default=[0.5, 0.2, 0.1])
-    parser.add_argument("--places", type=int, nargs="+", default=[1, 3, 10])
     parser.add_argument(
-        "--fail-above", type=float, help="largest accepted ms above 1.2 times poselib's median"
+        "--places", type=int, nargs="+", default=[1, 3, 10], help="numbers of locations"
     )
     options = parser.parse_args()
 
@@ -465,8 +464,7 @@ def main() -> int:
     print(f"{options.queries} queries per setting, one thread, load {os.getloadavg()[0]:.1f}")
     print(table(rows))
     print(f"ours minus 1.2 times poselib, p50: at most {worst_ms:.1f} ms")
-    return 0 if options.fail_above is None or worst_ms <= options.fail_above else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -17,7 +17,6 @@ from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("PINHOLE", 1600, 1200, (1000.0, 1000.0, 800.0, 600.0))
 STEP_M = 1.0
-GAP_M = 1000.0  # between disconnected parts
 # x to the right along the street, y down, z away from it
 LOOKING_LEFT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -77,10 +76,8 @@ class Street:
         return MapIndex.build(self.xyz, self.names, images, keypoints, points)
 
 
-def make_street(
-    num_images: int, num_points: int, num_seen: int, num_keypoints: int, num_parts: int = 1
-) -> Street:
-    """Build a street, in disconnected parts a kilometre apart; deterministic."""
+def make_street(num_images: int, num_points: int, num_seen: int, num_keypoints: int) -> Street:
+    """Build a street; deterministic."""
     rng = np.random.default_rng(0)
     length = num_images * STEP_M
     xyz = np.stack(
@@ -92,12 +89,9 @@ def make_street(
         axis=1,
     )
     along_m = (np.arange(num_images) + 0.5) * STEP_M
-    part, part_of_point = ((x * num_parts / length).astype(np.int64) for x in (along_m, xyz[:, 0]))
-    bounds = np.searchsorted(part_of_point, np.arange(num_parts + 1))
-    xyz[:, 0] += part_of_point * GAP_M
-    poses = tuple(looking_left(x, 0.0, 0.0, 0.0) for x in (along_m + part * GAP_M).tolist())
+    poses = tuple(looking_left(x, 0.0, 0.0, 0.0) for x in along_m.tolist())
     nearest = np.round(along_m * num_points / length - num_seen / 2)
-    first = np.clip(nearest, bounds[part], bounds[part + 1] - num_seen).astype(np.int64)
+    first = np.clip(nearest, 0, num_points - num_seen).astype(np.int64)
     return Street(xyz, poses, first, num_seen, num_keypoints)
 
 
@@ -112,12 +106,6 @@ def looking_left(x: float, y: float, z: float, angle_rad: float) -> RigidTransfo
 def random_pose(street: Street, rng: np.random.Generator, margin: int) -> RigidTransform:
     """Draw a query pose at least ``margin`` images from the ends of the street."""
     x = rng.uniform(margin, len(street.poses) - margin) * STEP_M
-    return looking_left(x, rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3))
-
-
-def pose_near(street: Street, rng: np.random.Generator, image: int) -> RigidTransform:
-    """Draw a query pose within half a step of an image."""
-    x = street.poses[image].center()[0] + rng.uniform(-0.5, 0.5) * STEP_M
     return looking_left(x, rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3))
 
 

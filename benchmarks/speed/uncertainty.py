@@ -125,9 +125,7 @@ def main() -> int:
         best, cpu = min(seconds(arguments) for _ in range(options.repeat))
         rows.append((model, f"{first:.2f}", f"{best:.2f}", f"{cpu:.2f}"))
     print(table(rows))
-    print(
-        "(the first call compiles, once per machine)\n\ncompared with Ceres, poses and cameras fixed"
-    )
+    print("(the first call compiles)\n\ncompared with Ceres, poses and cameras fixed")
     rows = [("cameras", "observations", "Ceres, s", "ours, s", "relative difference")]
     worst = 0.0
     for model in CAMERAS:
