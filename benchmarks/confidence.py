@@ -1,19 +1,20 @@
-"""The confidence of poses: data for it, its calibration, and how well it tells right from wrong.
+"""Collect data for the confidence of poses, and fit and evaluate its calibration.
 
     .venv/bin/python benchmarks/confidence.py collect --scene DIR [--scene DIR ...] \\
         [--unrelated DIR] --preset classic [--set KEY=VALUE ...] -o classic.csv
     .venv/bin/python benchmarks/confidence.py fit classic.csv modern.csv [--write]
 
-A scene is a folder with mapping/, query/ and query_gt/ in kapture. ``collect`` maps each and
-localizes in it, with every pose kept: its own queries, the same made worse (half and a third of the
-size, blurred, dark, cropped, covered) and upside down; and the images of all other scenes
-and of a folder of photographs, which have no right pose there. ``fit`` leaves out one
-scene after the other, with its images as queries of the others, and prints what the calibration of
-the rest makes of it beside the rule "at least 12 inliers"; ``--write`` puts the calibration of all
-data into the package. Scenes whose names begin alike, up to the first ``_``, are the same place.
+A scene is a folder with mapping/, query/ and query_gt/ in kapture. ``collect`` maps each scene,
+localizes queries in it and keeps every pose. Positive queries are those of the scene, degraded
+copies (half and a third of the size, blurred, dark, cropped, occluded) and upside-down copies;
+negative queries are the images of all other scenes and of a folder of unrelated photographs.
+``fit`` evaluates by leave-one-scene-out cross-validation, excluding the test scene's images as
+negatives, and compares the calibration with the rule "at least 12 inliers"; ``--write`` fits all
+data and writes the calibration into the package. Scenes whose names share the part before the first
+``_`` show the same location.
 
-A pose is right if its centre is off by at most a tenth of the distance to what the camera sees, and
-its rotation by at most 10 degrees: a rule that maps without metres can have.
+A pose is correct if its centre error is at most a tenth of the median depth of the visible map
+points and its rotation error at most 10 degrees. This also works for maps without metric scale.
 """
 
 from __future__ import annotations
@@ -49,17 +50,18 @@ from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 MAX_ERROR, MAX_ANGLE_DEG = 0.1, 10.0
-# a term that speaks for a pose may not be given a weight against it, and the reverse
-AGAINST = ("residual", "misfit", "deviation", "viewing_angle", "distance_ratio")
-# presets whose features have a calibration of their own, and what these are called: SIFT's fit
-# badly on blurred images and are right, ALIKED's are not
-OWN = {"modern": "aliked"}
+ACCEPTED = 0.6  # minimum confidence of an accepted pose
+# terms that lower the confidence; the weights of all others are nonnegative
+NEGATIVE_TERMS = ("residual", "misfit", "deviation", "viewing_angle", "distance_ratio")
+# presets with a separate calibration, and its name: in blurred images SIFT has large residuals in
+# correct poses, ALIKED does not
+PRESET_CALIBRATIONS = {"modern": "aliked"}
 Pixels = NDArray[np.uint8]
 Case = tuple[str, str, Pixels, Camera, RigidTransform | None]
 
 
-def place(scene: str) -> str:
-    """What scenes of the same place have in common."""
+def location(scene: str) -> str:
+    """Return the location of a scene from its name."""
     return scene.split("_")[0]
 
 
@@ -67,7 +69,7 @@ def place(scene: str) -> str:
 
 
 def images_of(folder: Path, truth: Path | None = None, most: int = 10_000) -> Iterator[Case]:
-    """The images of a kapture folder, at most so many, with their true poses."""
+    """Yield at most ``most`` images of a kapture folder with their true poses."""
     opened = KaptureFolder(folder)
     data = opened.read()
     poses = data if truth is None else KaptureFolder(truth).read()
@@ -77,10 +79,10 @@ def images_of(folder: Path, truth: Path | None = None, most: int = 10_000) -> It
         yield name, "", pixels, data.camera_of(name), poses.cam_from_world(name)
 
 
-def worse(
+def degraded(
     pixels: Pixels, camera: Camera, rng: np.random.Generator
 ) -> Iterator[tuple[str, Pixels, Camera]]:
-    """An image made worse in several ways; its pose stays."""
+    """Yield degraded versions of an image; its pose stays valid for all of them."""
     height, width = pixels.shape[:2]
     for name, share in (("half", 0.5), ("third", 0.33)):
         size = int(width * share), int(height * share)
@@ -103,29 +105,29 @@ def worse(
 
 
 def cases(scene: Path, scenes: Sequence[Path], unrelated: Path | None, most: int) -> Iterator[Case]:
-    """Every query of one map: name, kind, pixels, camera, and its pose where it has one."""
+    """Yield name, kind, pixels, camera and, for positive queries, the true pose."""
     rng = np.random.default_rng(0)
-    turned = RigidTransform((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     for name, _, pixels, camera, pose in images_of(scene / "query", scene / "query_gt", most):
         if pose is None:
             continue
         yield name, "own", pixels, camera, pose
-        for kind, changed, changed_camera in worse(pixels, camera, rng):
+        for kind, changed, changed_camera in degraded(pixels, camera, rng):
             yield f"{name}#{kind}", kind, changed, changed_camera, pose
-        # a turned image has its principal point turned with it
+        # the principal point rotates with the image
         cx, cy = principal_point_px(camera)
-        across, along = camera.width - 2 * cx, camera.height - 2 * cy
-        upside = np.ascontiguousarray(pixels[::-1, ::-1])
-        of_upside = shift_principal_point(camera, across, along)
-        yield f"{name}#upside_down", "upside_down", upside, of_upside, turned @ pose
-    seen = {place(scene.name)}
+        shift_x, shift_y = camera.width - 2 * cx, camera.height - 2 * cy
+        rotated = np.ascontiguousarray(pixels[::-1, ::-1])
+        rotated_camera = shift_principal_point(camera, shift_x, shift_y)
+        yield f"{name}#upside_down", "upside_down", rotated, rotated_camera, half_turn @ pose
+    seen = {location(scene.name)}
     for other in scenes:
-        if place(other.name) in seen:
+        if location(other.name) in seen:
             continue
-        seen.add(place(other.name))
+        seen.add(location(other.name))
         for part in ("mapping", "query"):
             for name, _, pixels, camera, _ in images_of(other / part, most=most):
-                yield f"{other.name}/{name}", f"of {place(other.name)}", pixels, camera, None
+                yield f"{other.name}/{name}", f"of {location(other.name)}", pixels, camera, None
     for path in sorted(unrelated.iterdir()) if unrelated else ():
         pixels = read_image_rgb(path)
         height, width = pixels.shape[:2]
@@ -140,41 +142,43 @@ def collect(
     most: int,
     changes: Sequence[str] = (),
 ) -> pd.DataFrame:
-    """Localize every query of one map, and keep every pose."""
+    """Localize every query in the map of one scene."""
     with TemporaryDirectory() as folder:
-        place = Path(folder) / "map"
-        built = megloc.build_map(scene / "mapping", preset, set=assigned(changes), workspace=place)
-        every = {"min_confidence": 0.0, "sure_confidence": None}
-        localization = built.options.localization.model_copy(update=every)
+        workspace = Path(folder) / "map"
+        built = megloc.build_map(
+            scene / "mapping", preset, set=assigned(changes), workspace=workspace
+        )
+        keep_all = {"min_confidence": 0.0, "sure_confidence": None}
+        localization = built.options.localization.model_copy(update=keep_all)
         options = built.options.model_copy(update={"localization": localization})
         localizer = Localizer(built.kapture_map, options=options)
         rows = []
         for name, kind, pixels, camera, truth in cases(scene, scenes, unrelated, most):
-            found = localizer.localize(pixels, camera)
+            result = localizer.localize(pixels, camera)
             row: dict[str, object] = {
                 "scene": scene.name,
                 "preset": preset,
                 "query": name,
                 "kind": kind,
                 "belongs": truth is not None,
-                "localized": bool(found),
+                "localized": bool(result),
                 "right": False,
             }
-            if isinstance(found, Pose):
-                row |= {"num_inliers": found.num_inliers, **found.evidence}
+            if isinstance(result, Pose):
+                row |= {"num_inliers": result.num_inliers, **result.evidence}
                 if truth is not None:
-                    row["right"] = is_right(found.cam_from_world, truth, localizer)
+                    row["right"] = is_right(result.cam_from_world, truth, localizer)
             rows.append(row)
     return pd.DataFrame(rows)
 
 
 def is_right(pose: RigidTransform, truth: RigidTransform, localizer: Localizer) -> bool:
-    """Whether a pose is near enough to the truth for what the camera sees."""
+    """Compare a pose with the truth, relative to the median depth of the visible map points."""
     angle = 2 * np.degrees(np.arccos(min(1.0, abs((pose @ truth.inverse()).quat_wxyz[0]))))
     points = localizer.map.folder.points3d()[:, :3]
-    ahead = truth.apply(points)
-    ahead = ahead[(ahead[:, 2] > 0) & (np.abs(ahead[:, :2]) < ahead[:, 2:]).all(axis=1)]
-    distance = float(np.median(np.linalg.norm(ahead, axis=1))) if len(ahead) else 1.0
+    points = truth.apply(points)
+    visible = points[(points[:, 2] > 0) & (np.abs(points[:, :2]) < points[:, 2:]).all(axis=1)]
+    distance = float(np.median(np.linalg.norm(visible, axis=1))) if len(visible) else 1.0
     error = float(np.linalg.norm(pose.center() - truth.center()))
     return error <= MAX_ERROR * distance and float(angle) <= MAX_ANGLE_DEG
 
@@ -182,10 +186,10 @@ def is_right(pose: RigidTransform, truth: RigidTransform, localizer: Localizer) 
 # ------------------------------------------------------------------------------- calibration
 
 
-def fitted(table: pd.DataFrame, terms: Sequence[str], origin: str) -> confidence.Calibration:
-    """The logistic model of the poses of a table: regularised, its signs as they must be."""
+def fitted(table: pd.DataFrame, origin: str) -> confidence.Calibration:
+    """Fit a regularised logistic model to the poses, with the sign of each weight constrained."""
     posed = table[table.localized]
-    values = posed[list(terms)].to_numpy(np.float64)
+    values = posed[list(TERMS)].to_numpy(np.float64)
     right = posed.right.to_numpy(np.float64)
     mean, spread = values.mean(axis=0), values.std(axis=0) + 1e-9
     scaled = (values - mean) / spread
@@ -197,84 +201,92 @@ def fitted(table: pd.DataFrame, terms: Sequence[str], origin: str) -> confidence
         value = np.mean(np.logaddexp(0, logits) - right * logits) + penalty @ parameters / 2
         return float(value), np.r_[excess.mean(), scaled.T @ excess / len(right)] + penalty
 
-    signs = [(None, 0.0) if term in AGAINST else (0.0, None) for term in terms]
-    start = np.zeros(len(terms) + 1)
-    found = minimize(loss, start, jac=True, bounds=[(None, None), *signs], method="L-BFGS-B").x
-    weights = found[1:] / spread
-    kept = {t: round(float(w), 4) for t, w in zip(terms, weights, strict=True) if abs(w) > 1e-6}
-    return confidence.Calibration(origin, round(float(found[0] - weights @ mean), 4), kept)
+    signs = [(None, 0.0) if term in NEGATIVE_TERMS else (0.0, None) for term in TERMS]
+    start = np.zeros(len(TERMS) + 1)
+    solution = minimize(loss, start, jac=True, bounds=[(None, None), *signs], method="L-BFGS-B").x
+    weights = solution[1:] / spread
+    kept = {t: round(float(w), 4) for t, w in zip(TERMS, weights, strict=True) if abs(w) > 1e-6}
+    return confidence.Calibration(origin, round(float(solution[0] - weights @ mean), 4), kept)
 
 
 def confidences(table: pd.DataFrame, model: confidence.Calibration) -> NDArray[np.float64]:
-    """Confidences of the rows; NaN without a pose."""
-    found = np.full(len(table), np.nan)
-    for at, row in enumerate(table.fillna({MAP_POINTS: 1.0}).to_dict("records")):
+    """Return the confidence of each row; NaN without a pose."""
+    probability = np.full(len(table), np.nan)
+    for number, row in enumerate(table.fillna({MAP_POINTS: 1.0}).to_dict("records")):
         if row["localized"]:
-            found[at] = model.probability(row)
-    return found
+            probability[number] = model.probability(row)
+    return probability
 
 
-def left_out(table: pd.DataFrame, terms: Sequence[str]) -> NDArray[np.float64]:
-    """Confidences of each scene's rows by what the others say, which its images have no part in."""
-    places = table.scene.map(place)
-    found = np.full(len(table), np.nan)
-    for own in sorted(set(places)):
-        test = (places == own).to_numpy()
-        strange = (table.kind == f"of {own}").to_numpy()
-        model = fitted(table[~test & ~strange], terms, "")
-        found[test] = confidences(table[test], model)
-    return found
+def left_out(table: pd.DataFrame) -> NDArray[np.float64]:
+    """Return leave-one-location-out confidences.
+
+    The training rows contain neither queries nor negatives of the test location.
+    """
+    locations = table.scene.map(location)
+    scores = np.full(len(table), np.nan)
+    for held_out in sorted(set(locations)):
+        test = (locations == held_out).to_numpy()
+        negatives = (table.kind == f"of {held_out}").to_numpy()
+        model = fitted(table[~test & ~negatives], "")
+        scores[test] = confidences(table[test], model)
+    return scores
 
 
-def judged(table: pd.DataFrame, terms: Sequence[str]) -> NDArray[np.float64]:
-    """As :func:`left_out`, by the calibration that poses of the preset get."""
-    found = left_out(table, terms)
-    for preset in OWN:
-        own = (table.preset == preset).to_numpy()
-        found[own] = left_out(table[own].reset_index(drop=True), terms)
-    return found
+def cross_validated(table: pd.DataFrame) -> NDArray[np.float64]:
+    """Cross-validate with a separate calibration for each preset that has one."""
+    scores = left_out(table)
+    for preset in PRESET_CALIBRATIONS:
+        rows = (table.preset == preset).to_numpy()
+        scores[rows] = left_out(table[rows].reset_index(drop=True))
+    return scores
 
 
-def summary(table: pd.DataFrame, found: NDArray[np.float64], accepted: float) -> dict[str, str]:
-    """One line of the table that is printed."""
+def summary(table: pd.DataFrame, scores: NDArray[np.float64], accepted: float) -> dict[str, str]:
+    """Return a row of the table of acceptance rules."""
     posed, right = table.localized.to_numpy(), table.right.to_numpy()
-    taken = posed & (found >= accepted)
-    strays, own = ~table.belongs.to_numpy(), (table.kind == "own").to_numpy()
-    wrong, count = int((taken & strays).sum()), int(strays.sum())
+    taken = posed & (scores >= accepted)
+    negative, original = ~table.belongs.to_numpy(), (table.kind == "own").to_numpy()
+    wrong, count = int((taken & negative).sum()), int(negative.sum())
     low, high = (100 * float(end[0]) for end in confidence_interval(np.array([wrong]), count))
-    # what an earlier rule took
-    kept, before = int((taken & own & right).sum()), int((posed & own & right).sum())
-    worse_kept, worse_all = (int((these & right).sum()) for these in (taken & ~own, posed & ~own))
+    kept, total = (int((rows & original & right).sum()) for rows in (taken, posed))
+    degraded_kept, degraded_total = (
+        int((rows & ~original & right).sum()) for rows in (taken, posed)
+    )
     return {
-        "wrong queries": str(count),
+        "negative queries": str(count),
         "accepted": f"{wrong} ({100 * wrong / count:.2f} %, {low:.2f}-{high:.2f})",
-        "wrong poses of own": str(int((taken & ~strays & ~right).sum())),
-        "right own": f"{kept} of {before}",
-        "right, made worse": f"{worse_kept} of {worse_all}",
+        "wrong poses of positive queries": str(int((taken & ~negative & ~right).sum())),
+        "correct, original": f"{kept} of {total}",
+        "correct, degraded": f"{degraded_kept} of {degraded_total}",
     }
 
 
-def report(table: pd.DataFrame, found: NDArray[np.float64], accepted: float) -> None:
-    """Print how poses are told apart by these confidences."""
+def report(table: pd.DataFrame, scores: NDArray[np.float64]) -> None:
+    """Print accepted and rejected poses, the calibration and the wrong poses that are accepted."""
     inliers = np.where(table.localized, 1.0, np.nan)
     lines = {"12 inliers": summary(table, inliers, 0.5)}
-    lines[f"confidence {accepted:g}"] = summary(table, found, accepted)
+    lines[f"confidence {ACCEPTED:g}"] = summary(table, scores, ACCEPTED)
     print(pd.DataFrame(lines).T.to_string())
     posed = table.localized.to_numpy()
     right = table.right.to_numpy()[posed]
-    bins = reliability(found[posed], right)
+    bins = reliability(scores[posed], right)
     by_inliers = risk_by_score(table.num_inliers.to_numpy(np.float64)[posed], right).mean()
     print(
         f"calibration error {calibration_error(bins):.3f}; area under risk against coverage "
-        f"{risk_by_score(found[posed], right).mean():.4f}, by inliers {by_inliers:.4f}, at best "
+        f"{risk_by_score(scores[posed], right).mean():.4f}, by inliers {by_inliers:.4f}, at best "
         f"{least_area(right):.4f}"
     )
-    for one in bins:
-        bounds = f"{one.low:.1f}-{one.high:.1f}"
-        print(f"  {bounds}: {one.num_poses:5d} poses, {one.share_right:.2f} right")
-    table = table.assign(confidence=found)
-    missed = table[posed & (table.confidence >= accepted) & ~table.right]
-    print(missed.groupby(["scene", "kind"]).size().to_string() if len(missed) else "none wrong")
+    for entry in bins:
+        bounds = f"{entry.low:.1f}-{entry.high:.1f}"
+        print(f"  {bounds}: {entry.num_poses:5d} poses, {entry.share_right:.2f} correct")
+    table = table.assign(confidence=scores)
+    missed = table[posed & (table.confidence >= ACCEPTED) & ~table.right]
+    print(
+        missed.groupby(["scene", "kind"]).size().to_string()
+        if len(missed)
+        else "no wrong pose accepted"
+    )
 
 
 def write(models: Mapping[str, confidence.Calibration]) -> None:
@@ -290,27 +302,26 @@ def write(models: Mapping[str, confidence.Calibration]) -> None:
 
 
 def origin_of(table: pd.DataFrame) -> str:
-    """What a calibration was fitted to, in words."""
+    """Describe the data of a calibration."""
     scenes, presets = (", ".join(sorted(set(table[name]))) for name in ("scene", "preset"))
     return f"{int(table.localized.sum())} poses of {presets} in {scenes}"
 
 
 def main() -> None:
-    """Run it."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    collecting = commands.add_parser("collect")
+    collecting = commands.add_parser(
+        "collect", help="localize in each scene and write a table of poses"
+    )
     collecting.add_argument("--scene", type=Path, action="append", required=True)
-    collecting.add_argument("--map", action="append", help="localize in the maps of these only")
+    collecting.add_argument("--map", action="append", help="use only the maps of these scenes")
     collecting.add_argument("--unrelated", type=Path)
     collecting.add_argument("--preset", default="classic")
     collecting.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    collecting.add_argument("--most", type=int, default=60, help="images of one folder")
+    collecting.add_argument("--most", type=int, default=60, help="images per folder")
     collecting.add_argument("-o", "--output", type=Path, required=True)
-    fitting = commands.add_parser("fit")
+    fitting = commands.add_parser("fit", help="evaluate, and with --write store, a calibration")
     fitting.add_argument("tables", type=Path, nargs="+")
-    fitting.add_argument("--terms", nargs="+", choices=list(TERMS), default=list(TERMS))
-    fitting.add_argument("--accepted", type=float, default=0.6)
     fitting.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.command == "collect":
@@ -318,19 +329,22 @@ def main() -> None:
         for scene in options.scene:
             if options.map and scene.name not in options.map:
                 continue
-            chosen = options.unrelated, options.preset, options.most, options.set
-            parts.append(collect(scene, options.scene, *chosen))
+            settings = options.unrelated, options.preset, options.most, options.set
+            parts.append(collect(scene, options.scene, *settings))
             pd.concat(parts).to_csv(options.output, index=False)
             print(f"{scene.name}: {len(parts[-1])} queries, {parts[-1].localized.sum()} poses")
         return
     everything = pd.concat([pd.read_csv(path) for path in options.tables], ignore_index=True)
-    found = judged(everything, options.terms)
+    scores = cross_validated(everything)
     for name, table in (("all", everything), *everything.groupby("preset")):
         print(f"\n{name}: {len(table)} queries of {table.scene.nunique()} maps")
-        report(table, found[table.index], options.accepted)
+        report(table, scores[table.index])
     fits = {confidence.OF_ALL: everything}
-    fits |= {kind: everything[everything.preset == preset] for preset, kind in OWN.items()}
-    models = {n: fitted(part, options.terms, origin_of(part)) for n, part in fits.items()}
+    fits |= {
+        kind: everything[everything.preset == preset]
+        for preset, kind in PRESET_CALIBRATIONS.items()
+    }
+    models = {n: fitted(part, origin_of(part)) for n, part in fits.items()}
     print("", *models.items(), sep="\n")
     if options.write:
         write(models)

@@ -1,12 +1,12 @@
-"""Queries with a wrong focal length: what the remark names, and what becomes of the confidence.
+"""Effect of a wrong focal length on the pose, its confidence and the focal-length remark.
 
     .venv/bin/python benchmarks/focal_length.py --map NAME MAP QUERY TRUTH [--map ...] \\
         [--factors 1] [--seeds 0 1 2] [--every 2] [-o poses.csv]
 
-MAP is a map to localize in, QUERY a kapture folder of queries with the right focal length, TRUTH
-one with their poses. Every query is localized with its focal length times each factor, and every
-pose is kept. Matches of descriptors are made once per query; their verification, which knows the
-camera, is made for every factor.
+MAP is a map to localize in, QUERY a kapture folder of queries with the correct focal length, TRUTH
+a kapture folder with their poses. Each query is localized with its focal length multiplied by each
+factor, and every pose is kept. Descriptors are matched once per query; geometric verification,
+which depends on the camera, runs for each factor.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ REMARK = re.compile(r"does not fit: (\d+) \+- (\d+) px")
 
 
 def with_features(query: Query, localizer: Localizer) -> Query:
-    """The query with its features, which do not depend on the focal length."""
+    """Extract the features of a query once for all focal lengths."""
     if query.features:
         return query
     (local,) = localizer.types
@@ -46,26 +46,26 @@ def with_features(query: Query, localizer: Localizer) -> Query:
 
 
 MATCHES: dict[tuple[str, ...], Any] = {}
-"""Of one query, by the names of map images."""
+"""Descriptor matches of the current query by the names of the map images."""
 
 
-def matched_once(matcher: Any, query: Any, others: Any, labels: Sequence[str]) -> Any:
-    """The matches of a query's descriptors, which do not depend on the focal length."""
+def cached_matches(matcher: Any, query: Any, others: Any, labels: Sequence[str]) -> Any:
+    """Match descriptors once per query; the focal length has no effect on them."""
     if (key := tuple(labels)) not in MATCHES:
         MATCHES[key] = list(match_all(matcher, query, others, labels))
     return MATCHES[key]
 
 
 def localized(
-    place: Sequence[str], factors: Sequence[float], seeds: Sequence[int], every: int
+    paths: Sequence[str], factors: Sequence[float], seeds: Sequence[int], every: int
 ) -> Iterator[dict[str, Any]]:
-    """A row per query, factor and seed."""
-    name, *folders = place
-    opened = KaptureMap.open(Path(folders[0]))
+    """Yield a row per query, factor and seed."""
+    name, *folders = paths
+    kapture_map = KaptureMap.open(Path(folders[0]))
     truth = KaptureFolder(Path(folders[2])).read()
     localizers = {
         seed: Localizer(
-            opened,
+            kapture_map,
             options=options_of_preset(
                 assignments={
                     "localization.min_confidence": 0.0,
@@ -76,32 +76,32 @@ def localized(
         )
         for seed in seeds
     }
-    queries = list(KaptureQueries(KaptureFolder(Path(folders[1])), opened))
-    for given in queries[::every]:
-        query = with_features(given, localizers[seeds[0]])
+    queries = list(KaptureQueries(KaptureFolder(Path(folders[1])), kapture_map))
+    for original in queries[::every]:
+        query = with_features(original, localizers[seeds[0]])
         MATCHES.clear()
         pose = truth.cam_from_world(query.name)
         for seed, factor in ((seed, factor) for seed in seeds for factor in factors):
-            wrong = replace(query, camera=scale_focal(query.camera, factor))
-            found = localizers[seed].localize_query(wrong)
+            scaled = replace(query, camera=scale_focal(query.camera, factor))
+            result = localizers[seed].localize_query(scaled)
             row = {"map": name, "query": query.name, "factor": factor, "seed": seed}
-            row |= {"inliers": found.num_inliers, "confidence": found.confidence or 0.0}
+            row |= {"inliers": result.num_inliers, "confidence": result.confidence or 0.0}
             row |= {"error_m": np.inf, "named_px": np.nan, "sigma_px": np.nan}
             row["right_px"] = focal_px(query.camera)
-            if isinstance(found, Pose) and pose is not None:
-                off = found.cam_from_world.center() - pose.center()
-                row["error_m"] = float(np.linalg.norm(off))
-            if named := REMARK.search("; ".join(found.remarks)):
+            if isinstance(result, Pose) and pose is not None:
+                error = result.cam_from_world.center() - pose.center()
+                row["error_m"] = float(np.linalg.norm(error))
+            if named := REMARK.search("; ".join(result.remarks)):
                 row |= {"named_px": float(named[1]), "sigma_px": float(named[2])}
             yield row
 
 
 def summary(poses: pd.DataFrame) -> pd.DataFrame:
-    """Counts of each map and factor."""
+    """Count poses, remarks and errors per map and factor."""
     remark = poses.named_px.notna()
     far = (poses.error_m > FAR_M) & (poses.confidence >= CONFIDENT)
     enough = poses.inliers >= MIN_INLIERS
-    # a deviation below a pixel is written as 0
+    # a standard deviation below a pixel is printed as 0
     right = (poses.named_px - poses.right_px).abs() <= 3 * poses.sigma_px.clip(lower=1)
     columns = {
         "poses": np.isfinite(poses.error_m),
@@ -122,18 +122,18 @@ def main() -> None:
     parser.add_argument("--map", nargs=4, metavar=names, action="append", required=True)
     parser.add_argument("--factors", nargs="+", type=float, default=FACTORS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--every", type=int, default=1, help="of the queries")
-    parser.add_argument("-o", "--output", type=Path, help="a row per pose")
-    given = parser.parse_args()
-    with patch.object(live_source, "match_all", matched_once):
+    parser.add_argument("--every", type=int, default=1, help="use every N-th query")
+    parser.add_argument("-o", "--output", type=Path, help="CSV file with a row per pose")
+    options = parser.parse_args()
+    with patch.object(live_source, "match_all", cached_matches):
         rows = [
             row
-            for place in given.map
-            for row in localized(place, given.factors, given.seeds, given.every)
+            for paths in options.map
+            for row in localized(paths, options.factors, options.seeds, options.every)
         ]
     poses = pd.DataFrame(rows)
-    if given.output is not None:
-        poses.to_csv(given.output, index=False)
+    if options.output is not None:
+        poses.to_csv(options.output, index=False)
     print(summary(poses).to_string())
 
 

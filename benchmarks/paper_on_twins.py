@@ -4,22 +4,22 @@
     .venv/bin/python benchmarks/paper_on_twins.py --wiring free --dataset inloc
 
 ``random``: seeded random weights in every official container. Each twin must run to its recall
-table, with every step of the paper on that its data permit: what is off, and why, is printed. Such
-networks localize by chance; the figures are no recall of anything.
+table with every step of the paper that its data permit; disabled steps are printed with the reason.
+Random networks localize by chance, so the recall has no meaning.
 
-``free``: the same steps with free weights in the slots of those that are not: ALIKED with nearest
+``free``: the same steps with freely licensed networks in place of the others: ALIKED with nearest
 neighbours, XFeat with LighterGlue, a VLAD of each, no segmentation, no LPIPS. Queries by day must
-reach 90 % within 0.25 m and 2 deg, 95 % within 0.5 m and 5 deg; InLoc's within its own 0.25 m and
-10 deg, 0.5 m and 10 deg. Exits with 1 below that. The weights are those of ../shared/data/weights
-where that is there, else of the user's folder.
+reach 90 % within 0.25 m and 2 deg, 95 % within 0.5 m and 5 deg; InLoc's within 0.25 m and
+10 deg, 0.5 m and 10 deg. The exit status is 1 below that. Weights are read from
+../shared/data/weights if it exists, else from the user's folder.
 
-``--rules`` runs ``free`` again with our rule in place of each rule that the preset has from the
-paper, one at a time and all together, and prints the recalls next to each other.
+``--rules`` repeats ``free`` with each of the paper's rules replaced by ours, one at a time and all
+together, and tabulates the recalls.
 
-The worlds are small, and images and numbers of keypoints smaller than the preset's, so that two
-cores do it in an hour. ``--size images`` leaves images and keypoints as they are, in worlds of few
-images; ``--size all`` the worlds too, for a GPU or a night. Nothing else is set. Arguments that are
-not known here go to ``megloc eval``. Nothing is downloaded.
+By default the worlds have few images, and images and keypoint limits are reduced, so that a run
+takes an hour on two cores. ``--size images`` keeps the preset's image size and keypoint limits;
+``--size all`` also keeps the full worlds, for a GPU or a run overnight. Nothing else is changed.
+Unknown arguments are passed to ``megloc eval``. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from timing import table  # noqa: E402
 
 DATASETS = ("aachen", "robotcar", "4seasons", "inloc")
 SMALL_WORLDS = {
-    # networks that see nothing need little to look at; each kind of query is there
+    # the smallest worlds with every kind of query
     "random": {
         "aachen": [
             *("num_places=1", "stations_per_place=3", "sequence_images=2", "day_queries=1"),
@@ -81,9 +81,9 @@ FREE_FEATURES = [
 ]
 FREE_INDOORS = ['localization.rank.options.distance={name="structure"}']
 FREE_OUTDOORS = ["preprocessing.masks.segmenter=null"]
-# the reranking of the slot that SuperPoint with SuperGlue has in the preset
+# the preset reranks with SuperPoint and SuperGlue
 FREE_RERANKING = ["reranking.local_type=xfeat"]
-# better rules that we measured, in place of the paper's; the last by dataset
+# rules with better measured results than the paper's
 OUR_RULES = {
     "reranking by coverage of all types": ["reranking.by=coverage", "reranking.local_type=none"],
     "pyramid counts verified matches": ["guided_pyramid.count=verified"],
@@ -92,7 +92,7 @@ OUR_RULES_OUTDOORS = {
     "clusters ranked by distinctive inliers": ["localization.rank.name=distinctive"],
     "pairs by poses within 60 deg": ["mapping_pairs.poses.max_angle_deg=60"],
 }
-# recall at the two finest thresholds of a dataset; conditions that are dark by design have no bar
+# minimum recall at the two finest thresholds of a dataset; dark conditions are not checked
 BARS = (0.90, 0.95)
 DARK = ("night", "night-rain", "night-all", "dusk", "all")
 SIZES = ("small", "images", "all")
@@ -100,13 +100,13 @@ SIZE_OPTIONS = ("width", "height", "size_px")
 
 
 def world_options(wiring: str, dataset: str, size: str) -> list[str]:
-    """What ``--set`` of ``megloc synth`` is given."""
+    """Return the ``--set`` assignments of ``megloc synth``."""
     small = SMALL_WORLDS[wiring][dataset] if size != "all" else []
     return [o for o in small if size == "small" or o.partition("=")[0] not in SIZE_OPTIONS]
 
 
 def options_of(wiring: str, dataset: str) -> list[str]:
-    """What ``--set`` is given, sizes apart."""
+    """Return the ``--set`` assignments of ``megloc eval`` other than sizes."""
     if wiring == "random":
         return []
     return [
@@ -117,40 +117,40 @@ def options_of(wiring: str, dataset: str) -> list[str]:
 
 
 def rules_of(dataset: str) -> dict[str, list[str]]:
-    """What ``--set`` is given for the paper's rules, and for ours one by one and all together."""
+    """Return the ``--set`` assignments of each set of rules."""
     ours = OUR_RULES | ({} if dataset == "inloc" else OUR_RULES_OUTDOORS)
-    every = [change for changes in ours.values() for change in changes]
-    return {"the paper's rules": [], **ours, "all of ours": every}
+    combined = [change for changes in ours.values() for change in changes]
+    return {"the paper's rules": [], **ours, "all of ours": combined}
 
 
 def run_twin(
-    wiring: str, dataset: str, place: Path, megloc: Megloc, size: str, arguments: Sequence[str]
+    wiring: str, dataset: str, folder: Path, megloc: Megloc, size: str, arguments: Sequence[str]
 ) -> tuple[float, Path]:
-    """Render a twin unless it is there, and localize in it; seconds and the workspace."""
-    root, workspace = place / "world", place / "workspace"
+    """Render a twin if missing and localize in it; return seconds and the workspace."""
+    root, workspace = folder / "world", folder / "workspace"
     if not root.is_dir():
         world = world_options(wiring, dataset, size)
-        changes = [part for each in world for part in ("--set", each)]
+        changes = [part for option in world for part in ("--set", option)]
         megloc("synth", ["synth", dataset, "-o", str(root), *changes])
-    changed = options_of(wiring, dataset) + (SMALL_NETWORKS[wiring] if size == "small" else [])
-    changes = [part for each in changed for part in ("--set", each)]
-    places = ["--root", str(root), "--workspace", str(workspace)]
+    assignments = options_of(wiring, dataset) + (SMALL_NETWORKS[wiring] if size == "small" else [])
+    changes = [part for option in assignments for part in ("--set", option)]
+    folders = ["--root", str(root), "--workspace", str(workspace)]
     seconds = megloc(
         "eval",
-        ["eval", f"synthetic-{dataset}", *places, "--preset", "megloc", *changes, *arguments],
+        ["eval", f"synthetic-{dataset}", *folders, "--preset", "megloc", *changes, *arguments],
     )
     return seconds, workspace
 
 
 def compare_rules(
-    dataset: str, place: Path, megloc: Megloc, size: str, arguments: Sequence[str]
+    dataset: str, folder: Path, megloc: Megloc, size: str, arguments: Sequence[str]
 ) -> str:
-    """A table of the recall of each condition, in percent, a row for each set of rules."""
+    """Tabulate the recall in percent: a row per set of rules, a column per condition."""
     lines: list[tuple[str, ...]] = []
     for name, rules in rules_of(dataset).items():
         changes = [part for rule in rules for part in ("--set", rule)]
-        _, found = run_twin("free", dataset, place, megloc, size, [*changes, *arguments])
-        rows = json.loads((found / "evaluation" / "recall.json").read_text())["rows"]
+        _, workspace = run_twin("free", dataset, folder, megloc, size, [*changes, *arguments])
+        rows = json.loads((workspace / "evaluation" / "recall.json").read_text())["rows"]
         lines = lines or [("rules", *(row["name"] for row in rows))]
         recalls = (" / ".join(f"{100 * at['recall']:.1f}" for at in row["recall"]) for row in rows)
         lines.append((name, *recalls))
@@ -158,7 +158,7 @@ def compare_rules(
 
 
 def below_bars(rows: Sequence[dict[str, object]]) -> list[str]:
-    """The bars that conditions by day do not reach."""
+    """Describe the daytime conditions whose recall is too low."""
     missed = []
     for row in rows:
         if row["name"] in DARK:
@@ -170,37 +170,38 @@ def below_bars(rows: Sequence[dict[str, object]]) -> list[str]:
 
 
 def main() -> None:
-    """Parse and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--wiring", choices=("random", "free"), required=True)
     parser.add_argument("--dataset", action="append", choices=DATASETS)
-    parser.add_argument("--size", choices=SIZES, default="small", help="what is as large as it is")
+    parser.add_argument(
+        "--size", choices=SIZES, default="small", help="parts that keep their full size"
+    )
     parser.add_argument("--rules", action="store_true", help="compare the paper's rules with ours")
     parser.add_argument("--workspace", type=Path, help="keep weights, worlds and runs here")
     options, arguments = parser.parse_known_args()
     if options.rules and options.wiring != "free":
         parser.error("--rules is for --wiring free: random networks have no recall")
     with tempfile.TemporaryDirectory(prefix="megloc-paper-") as temporary:
-        place = (options.workspace or Path(temporary)).resolve() / options.wiring
-        environment = weights_environment(WIRINGS[options.wiring], place)
-        if options.wiring == "random" and not (place / "weights").is_dir():
-            made = write_random_weights(place / "made")
-            add_weights(made, program(environment, place / "logs"))
-        print(f"weights: {SHARED_WEIGHTS if options.wiring == 'free' else place / 'weights'}")
+        folder = (options.workspace or Path(temporary)).resolve() / options.wiring
+        environment = weights_environment(WIRINGS[options.wiring], folder)
+        if options.wiring == "random" and not (folder / "weights").is_dir():
+            files = write_random_weights(folder / "made")
+            add_weights(files, program(environment, folder / "logs"))
+        print(f"weights: {SHARED_WEIGHTS if options.wiring == 'free' else folder / 'weights'}")
         missed: list[str] = []
         for dataset in options.dataset or DATASETS:
-            here = place / dataset
-            megloc = program(environment, here / "logs")
+            dataset_folder = folder / dataset
+            megloc = program(environment, dataset_folder / "logs")
             if options.rules:
-                compared = compare_rules(dataset, here, megloc, options.size, arguments)
-                print(f"\n{dataset}\n\n{compared}\n", flush=True)
+                recalls = compare_rules(dataset, dataset_folder, megloc, options.size, arguments)
+                print(f"\n{dataset}\n\n{recalls}\n", flush=True)
                 continue
-            seconds, found = run_twin(
-                options.wiring, dataset, here, megloc, options.size, arguments
+            seconds, workspace = run_twin(
+                options.wiring, dataset, dataset_folder, megloc, options.size, arguments
             )
-            evaluation = found / "evaluation"
+            evaluation = workspace / "evaluation"
             rows = json.loads((evaluation / "recall.json").read_text())["rows"]
-            manifest = json.loads((found / "stages" / "evaluation.json").read_text())
+            manifest = json.loads((workspace / "stages" / "evaluation.json").read_text())
             steps = [("step", "", "why")]
             steps += [
                 (step["name"], "on" if step["on"] else "OFF", step["why"])

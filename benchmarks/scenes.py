@@ -1,15 +1,15 @@
-"""Recall and median errors of real scenes over several seeds; and two such results compared.
+"""Recall and median errors of real scenes over several seeds, and a comparison of two results.
 
     .venv/bin/python benchmarks/scenes.py --scene DIR --scene DIR -o now.csv
     .venv/bin/python benchmarks/scenes.py --read now.csv --against before.csv
 
-A scene is a folder with mapping/, query/ and query_gt/ in kapture, which is mapped and localized
-in, or with map/, query/ and query_gt/, where the map is given. A seed changes all that draws random
-numbers: the vocabulary, the verification of query pairs, triangulation, pose estimation. Arguments
-that are not known here go to ``megloc eval`` and ``megloc localize``.
+A scene is a folder with mapping/, query/ and query_gt/ in kapture, or with map/ (a
+prebuilt map), query/ and query_gt/. The seed affects the vocabulary, the verification of query
+pairs, triangulation and pose estimation. Unknown arguments are passed to ``megloc eval`` and
+``megloc localize``.
 
-The comparison is paired by query: of every query the mean over the seeds, and a bootstrap over the
-queries of the difference of these means.
+The comparison is paired by query: errors are averaged over the seeds, and the difference of these
+means is bootstrapped over the queries.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ DRAWS = 10_000
 
 
 def megloc(*arguments: str) -> None:
-    """Run the ``megloc`` beside this Python; a failure ends this run with its exit code."""
+    """Run the ``megloc`` command of this environment; exit with its status on failure."""
     program = str(Path(sys.executable).with_name("megloc"))
     quiet = subprocess.DEVNULL
     done = subprocess.run([program, *arguments, "-q"], stdout=quiet, check=False)
@@ -50,24 +50,24 @@ def megloc(*arguments: str) -> None:
 
 
 def measure(scene: Path, seed: int, workspace: Path, arguments: Sequence[str]) -> pd.DataFrame:
-    """Errors of every query of a scene; those of a query without a pose are infinite."""
+    """Return the errors of every query of a scene; infinite without a pose."""
     seeds = [part for key in SEEDED for part in ("--set", f"{key}={seed}")]
     if (scene / "map").is_dir():
-        found, report = workspace / f"localized-{seed}", workspace / f"evaluation-{seed}"
-        localized = ("-i", str(scene / "map"), "--query", str(scene / "query"), "-o", str(found))
+        localized, report = workspace / f"localized-{seed}", workspace / f"evaluation-{seed}"
+        paths = ("-i", str(scene / "map"), "--query", str(scene / "query"), "-o", str(localized))
         benchmark = ("--set", "localization.sure_confidence=none")
-        megloc("localize", *localized, "-f", *benchmark, *seeds, *arguments)
+        megloc("localize", *paths, "-f", *benchmark, *seeds, *arguments)
         truth = ("--gt", str(scene / "query_gt"))
-        megloc("evaluate", "-i", str(found), *truth, "-o", str(report), "-f")
+        megloc("evaluate", "-i", str(localized), *truth, "-o", str(report), "-f")
     else:
-        places = ("--root", str(scene), "--workspace", str(workspace))
-        megloc("eval", "kapture", *places, *seeds, *arguments)
+        folders = ("--root", str(scene), "--workspace", str(workspace))
+        megloc("eval", "kapture", *folders, *seeds, *arguments)
         report = workspace / "evaluation"
     return errors_of(report).assign(scene=scene.name, seed=seed)[list(COLUMNS)]
 
 
 def errors_of(report: Path) -> pd.DataFrame:
-    """Errors of every query of an evaluation; those of a query without a pose are infinite."""
+    """Read the errors of every query of an evaluation; infinite without a pose."""
     rows = pd.read_csv(report / PER_QUERY_CSV)
     return pd.DataFrame(
         {
@@ -79,7 +79,7 @@ def errors_of(report: Path) -> pd.DataFrame:
 
 
 def hits(errors: pd.DataFrame) -> pd.DataFrame:
-    """One column per threshold: whether the query is within it, in percent."""
+    """Return a column per threshold: 100 if the query is within it, else 0."""
     return pd.DataFrame(
         {
             f"{m:g} m, {deg:g} deg": 100.0
@@ -90,7 +90,7 @@ def hits(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def summary(errors: pd.DataFrame) -> str:
-    """Recall, mean and standard deviation over the seeds, and the mean of the medians."""
+    """Tabulate the mean and standard deviation of the recall, and the mean median errors."""
     rows: list[tuple[str, ...]] = []
     for scene, of_scene in errors.groupby("scene", sort=False):
         recall = hits(of_scene).groupby(of_scene.seed).mean()
@@ -105,14 +105,14 @@ def summary(errors: pd.DataFrame) -> str:
 
 
 def interval(difference: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """95 % bootstrap interval of the mean over queries, of each column of (queries, columns)."""
+    """Return the 95 % bootstrap interval of the mean of each column of a (Q, C) array."""
     draws = np.random.default_rng(0).integers(0, len(difference), (DRAWS, len(difference)))
     low, high = np.quantile(difference[draws].mean(axis=1), (0.025, 0.975), axis=0)
     return low, high
 
 
 def comparison(now: pd.DataFrame, before: pd.DataFrame) -> str:
-    """Differences now minus before per scene and threshold, with 95 % bootstrap intervals."""
+    """Tabulate the differences (now minus before) with their 95 % bootstrap intervals."""
     rows: list[tuple[str, ...]] = [("scene", "figure", "before", "now", "difference", "verdict")]
     for scene in now.scene.unique():
         ours, theirs = (d[d.scene == scene] for d in (now, before))
@@ -120,7 +120,7 @@ def comparison(now: pd.DataFrame, before: pd.DataFrame) -> str:
             continue
         means = [hits(d).groupby(d["query"]).mean().sort_index() for d in (ours, theirs)]
         if not means[0].index.equals(means[1].index):
-            sys.exit(f"{scene}: the two results are not of the same queries")
+            sys.exit(f"{scene}: the two results have different queries")
         difference = (means[0] - means[1]).to_numpy()
         low, high = interval(difference)
         for column, name in enumerate(means[0].columns):
@@ -151,12 +151,12 @@ def main() -> None:
     parser.add_argument("--scene", type=lambda text: Path(text).resolve(), action="append")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
     parser.add_argument("--workspace", type=Path, help="keep the runs here")
-    parser.add_argument("--read", type=Path, help="a result written before, instead of scenes")
+    parser.add_argument("--read", type=Path, help="CSV file of an earlier run, instead of scenes")
     parser.add_argument("--against", type=Path, help="compare with this result")
     parser.add_argument("-o", "--output", type=Path, help="write the errors of every query here")
     options, arguments = parser.parse_known_args()
     if (options.read is None) == (options.scene is None):
-        parser.error("give scenes or --read")
+        parser.error("either --scene or --read is required")
     if options.read is not None:
         errors = pd.read_csv(options.read)
     else:

@@ -1,16 +1,16 @@
-"""A night descriptor for XFeat's detector, and a small SuperGlue for it, from free data alone.
+"""Train a night descriptor for XFeat's detector and a small SuperGlue on free data only.
 
     .venv/bin/python benchmarks/train_free.py worlds       # rendered squares by day and at night
-    .venv/bin/python benchmarks/train_free.py descriptor   # hours; the same command goes on
-    .venv/bin/python benchmarks/train_free.py matcher      # on the descriptors so trained
-    .venv/bin/python benchmarks/train_free.py evaluate     # recall on worlds of other seeds
-    .venv/bin/python benchmarks/train_free.py inliers --scene DIR ...    # matchers on real pairs
+    .venv/bin/python benchmarks/train_free.py descriptor   # hours; rerun to resume
+    .venv/bin/python benchmarks/train_free.py matcher      # on the trained descriptors
+    .venv/bin/python benchmarks/train_free.py evaluate     # recall on worlds with other seeds
+    .venv/bin/python benchmarks/train_free.py inliers --scene DIR ...    # matching of real pairs
 
-XFeat's weights are Apache-2.0 and the rendered worlds are this project's own, so what comes out may
-be published under a free licence. Other data: ``--also FOLDER`` (kapture with depth),
-``--photographs FOLDER``.
-Everything lies below ``runs/train_free``. The worlds are photograph albums as those of Aachen's
-twin, of seeds from 1000 on, those held out from 2000 on; no test, no other benchmark draws these.
+XFeat's weights are Apache-2.0 and the worlds are rendered by this project, so the trained weights
+may be published under a free licence. More data: ``--also FOLDER`` (kapture with depth),
+``--photographs FOLDER``. Output goes to ``runs/train_free``. The worlds are photograph albums like
+those of Aachen's twin, with seeds from 1000 (training) and 2000 (held out), which no test and no
+other benchmark uses.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MATCHER = {"layers": 12, "pairs_per_step": 8, "learning_rate": 5e-4, "steps": 10
 
 
 def write_album(root: Path, seed: int, work: Work = HERE) -> None:
-    """A world's photographs by day and at night as kapture, all with their depth."""
+    """Render the day and night photographs of a world, with depth, as kapture."""
     options = AachenTwinOptions.model_validate({"seed": seed, **ALBUM})
     frames = build_aachen_frames(options)
     images = [*frames.mapping(), *frames.queries()]
@@ -53,12 +53,12 @@ def write_album(root: Path, seed: int, work: Work = HERE) -> None:
     records = root / "sensors" / "records_data"
     render_frames(options.world(), images, partial(_write, records), with_depth=names, work=work)
     data = KaptureData()
-    still = RigidTransform.identity()
-    for number, frame in enumerate(sorted(images, key=lambda one: one.name)):
+    identity = RigidTransform.identity()
+    for number, frame in enumerate(sorted(images, key=lambda image: image.name)):
         camera, depth = f"{number}", f"{number}_depth"
         data.sensors[camera] = Sensor.from_camera(frame.camera)
         data.sensors[depth] = Sensor.from_camera(frame.camera, sensor_type="depth")
-        data.rigs[f"{number}_rig"] = {camera: still, depth: still}
+        data.rigs[f"{number}_rig"] = {camera: identity, depth: identity}
         data.trajectories[number, camera] = frame.cam_from_world
         data.records_camera[number, camera] = frame.name
         data.records_depth[number, depth] = f"{frame.name}.depth"
@@ -67,12 +67,12 @@ def write_album(root: Path, seed: int, work: Work = HERE) -> None:
 
 def _write(records: Path, frame: Frame, view: RenderedFrame) -> None:
     write_image(records / frame.name, view.image)
-    assert view.depth_m is not None  # it was asked for
+    assert view.depth_m is not None  # requested by write_album
     write_depth_map(records / f"{frame.name}.depth", view.depth_m)
 
 
 def worlds(root: Path, seeds: Sequence[int], workers: int) -> None:
-    """Render the worlds that are not there."""
+    """Render missing worlds."""
     with open_executor("processes", workers) as executor:
         for seed in seeds:
             folder = root / "worlds" / str(seed)
@@ -82,40 +82,40 @@ def worlds(root: Path, seeds: Sequence[int], workers: int) -> None:
 
 
 def train(task: str, root: Path, arguments: argparse.Namespace) -> None:
-    """Train, or go on."""
+    """Train from the start or from the last checkpoint."""
     rendered = [folder for folder in sorted((root / "worlds").iterdir()) if folder.is_dir()]
     held_out = [folder for folder in rendered if int(folder.name) >= HELD_OUT_SEED]
     kaptures = [*(folder for folder in rendered if folder not in held_out), *arguments.also]
-    chosen = {**PAIRS, **(DESCRIPTOR if task == "descriptor" else MATCHER)}
+    options = {**PAIRS, **(DESCRIPTOR if task == "descriptor" else MATCHER)}
     if task == "matcher":
-        chosen["features.options.descriptor_weights"] = str(root / "xfeat-night.safetensors")
-    asked = dict(text.split("=", 1) for text in arguments.set or ())
-    if "matcher_weights" in asked:
-        chosen.pop("layers", None)  # those of the weights
+        options["features.options.descriptor_weights"] = str(root / "xfeat-night.safetensors")
+    assignments = dict(text.split("=", 1) for text in arguments.set or ())
+    if "matcher_weights" in assignments:
+        options.pop("layers", None)  # defined by the weights
     name = {"descriptor": "xfeat-night", "matcher": "xfeat-night-superglue"}[task]
-    last = megloc.train(
+    metrics = megloc.train(
         task,
         root / f"{name}.safetensors",
         kaptures=kaptures,
         photographs=arguments.photographs,
         held_out=held_out,
         features="xfeat",
-        set={**chosen, **asked},
+        set={**options, **assignments},
     )
-    print({key: round(value, 5) for key, value in last.items()})
+    print({key: round(value, 5) for key, value in metrics.items()})
 
 
 def evaluate(root: Path, seeds: Sequence[int], scenes: Sequence[Path], workers: int) -> None:
-    """Recall with XFeat's own descriptors and with these, on Aachen's twins and on scenes."""
-    places = [("aachen", root / "twins" / str(seed)) for seed in seeds]
-    for seed, (_, twin) in zip(seeds, places, strict=True):
+    """Compare the recall of original and trained descriptors on twins of Aachen and on scenes."""
+    runs = [("aachen", root / "twins" / str(seed)) for seed in seeds]
+    for seed, (_, twin) in zip(seeds, runs, strict=True):
         if not twin.is_dir():
             AachenTwin(AachenTwinOptions(seed=seed)).write(twin)
     gains: dict[str, list[pd.DataFrame]] = {}
-    for dataset, folder in [*places, *(("kapture", scene) for scene in scenes)]:
+    for dataset, folder in [*runs, *(("kapture", scene) for scene in scenes)]:
         recalls = []
         for name, options in (
-            ("own", {}),
+            ("original", {}),
             ("night", {"descriptor_weights": str(root / "xfeat-night.safetensors")}),
         ):
             features = {"name": "xfeat", "options": {"max_keypoints": 2048, **options}}
@@ -131,26 +131,29 @@ def evaluate(root: Path, seeds: Sequence[int], scenes: Sequence[Path], workers: 
             print(f"{folder.name}, {name} descriptors\n{run.recall.round(3)}", flush=True)
         kind = "twins" if dataset == "aachen" else folder.name
         gains.setdefault(kind, []).append(recalls[1] - recalls[0])
-    for kind, found in gains.items():
-        print(f"mean gain, {kind}\n{(sum(found[1:], found[0]) / len(found)).round(3)}")
+    for kind, tables in gains.items():
+        print(f"mean gain, {kind}\n{(sum(tables[1:], tables[0]) / len(tables)).round(3)}")
 
 
 def inliers(root: Path, scenes: Sequence[Path]) -> None:
-    """Matches within 3 px of the true epipolar line, of pairs of real images with known poses.
+    """Count matches within 3 px of the true epipolar line in pairs of real images with known poses.
 
-    Each image of mapping/ with the three nearest that look within 60 degrees of it; the sum of all
-    pairs, and the share of the matches.
+    Each image of mapping/ is paired with the three nearest whose viewing direction is within 60
+    degrees. Printed are the number of inliers of all pairs and their share of the matches.
     """
-    own: dict[str, object] = {"max_keypoints": 2048}
-    night: dict[str, object] = {**own, "descriptor_weights": str(root / "xfeat-night.safetensors")}
+    original: dict[str, object] = {"max_keypoints": 2048}
+    night: dict[str, object] = {
+        **original,
+        "descriptor_weights": str(root / "xfeat-night.safetensors"),
+    }
     weights = str(root / "xfeat-night-superglue.safetensors")
     trained: dict[str, object] = {"weights": weights, "match_threshold": 0.05}
     nearest: dict[str, object] = {"max_ratio": 1.0}
-    ways = [
-        ("own descriptors, mutual nearest neighbours", own, "nn", nearest),
+    methods = [
+        ("original descriptors, mutual nearest neighbours", original, "nn", nearest),
         ("night descriptors, mutual nearest neighbours", night, "nn", nearest),
         ("night descriptors, SuperGlue", night, "superglue", trained),
-        ("own descriptors, LighterGlue", own, "lighterglue", {}),
+        ("original descriptors, LighterGlue", original, "lighterglue", {}),
     ]
     rows = []
     for scene in scenes:
@@ -158,31 +161,32 @@ def inliers(root: Path, scenes: Sequence[Path]) -> None:
         data = folder.read()
         poses = data.poses()
         pairs = _near_pairs(poses)
-        for way, features, matcher_name, options in ways:
+        for method, features, matcher_name, options in methods:
             extractor = load_plugin(LOCAL_FEATURES, "xfeat", features)
             matcher = load_plugin(MATCHERS, matcher_name, options)
-            found, right, total = {}, 0, 0
+            features_of, num_inliers, num_matches = {}, 0, 0
             for name in sorted({name for pair in pairs for name in pair}):
                 image = read_image_rgb(folder.image_path(name))
                 local = extractor.extract(image)
                 size = image.shape[1], image.shape[0]
-                found[name] = ImageFeatures(local.keypoints_px, local.descriptors, *size)
+                features_of[name] = ImageFeatures(local.keypoints_px, local.descriptors, *size)
             for a, b in pairs:
-                matches, _ = matcher.match(found[a], found[b])
+                matches, _ = matcher.match(features_of[a], features_of[b])
                 sides = []
                 for name, ids in zip((a, b), matches.T, strict=True):
-                    px = found[name].keypoints_px[ids, :2].astype(np.float64)
+                    px = features_of[name].keypoints_px[ids, :2].astype(np.float64)
                     rays = normalized_from_px(data.camera_of(name), px)
                     rays = np.column_stack([rays, np.ones(len(rays))])
                     sides += [rays, ray_slopes(data.camera_of(name), px, rays)]
                 rays_a, slopes_a, rays_b, slopes_b = sides
                 b_from_a = poses[b] @ poses[a].inverse()
                 errors = sampson_error_px(rays_a, slopes_a, rays_b, slopes_b, b_from_a)
-                right += int((errors < 3).sum())
-                total += len(matches)
-            rows.append((scene.name, way, len(pairs), right, right / max(total, 1)))
+                num_inliers += int((errors < 3).sum())
+                num_matches += len(matches)
+            share = num_inliers / max(num_matches, 1)
+            rows.append((scene.name, method, len(pairs), num_inliers, share))
             print(rows[-1], flush=True)
-    table = pd.DataFrame(rows, columns=["scene", "way", "pairs", "inliers", "share"])
+    table = pd.DataFrame(rows, columns=["scene", "method", "pairs", "inliers", "share"])
     print(table.to_string(index=False))
 
 
@@ -204,13 +208,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("task", choices=("worlds", "descriptor", "matcher", "evaluate", "inliers"))
     parser.add_argument("--root", type=Path, default=Path("runs") / "train_free")
-    parser.add_argument("--worlds", type=int, default=24, help="to train on")
-    parser.add_argument("--held-out", type=int, default=2, help="worlds")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)), help="evaluated")
-    parser.add_argument("--scene", type=Path, nargs="+", default=[], help="evaluated beside them")
+    parser.add_argument("--worlds", type=int, default=24, help="number of training worlds")
+    parser.add_argument("--held-out", type=int, default=2, help="number of held-out worlds")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=list(range(5)), help="twins to evaluate"
+    )
+    parser.add_argument("--scene", type=Path, nargs="+", default=[], help="scenes to evaluate")
     parser.add_argument("--also", action="append", default=[], metavar="KAPTURE")
     parser.add_argument("--photographs", action="append", default=[], metavar="FOLDER")
-    parser.add_argument("--set", action="append", metavar="KEY=VALUE", help="of megloc train")
+    parser.add_argument(
+        "--set", action="append", metavar="KEY=VALUE", help="option of megloc train"
+    )
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
     root = arguments.root

@@ -1,12 +1,12 @@
-"""Recall of the rendered twins over several seeds: the least and the greatest of each condition.
+"""Minimum and maximum recall of the rendered twins over several seeds, per condition.
 
     .venv/bin/python benchmarks/twins.py --dataset synthetic-aachen --dataset synthetic-4seasons
 
-A twin's images are the same bytes on every processor; what is computed from them is not. Features
-and networks use what instructions a processor has, so keypoints differ in their last bits, and a
-query whose inliers hardly suffice is found on one and lost on another. A seed changes as much: the
-vocabulary, triangulation, pose estimation. The range over seeds is therefore what to expect
-elsewhere. Arguments that are not known here go to ``megloc eval``.
+The rendered images are identical on every processor, but features and networks use
+processor-specific instructions, so keypoints differ in their last bits, and a query with barely
+enough inliers is localized on one machine and lost on another. The seed (vocabulary, triangulation,
+pose estimation) has an effect of similar size, so the range over seeds predicts the range over
+machines. Unknown arguments are passed to ``megloc eval``.
 """
 
 from __future__ import annotations
@@ -17,24 +17,26 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from scenes import SEEDED, megloc  # which knows the way to timing
+from scenes import SEEDED, megloc  # also adds speed/ to the import path
 from timing import table
 
 from megloc_kapture.evaluation.report.reports import RECALL_JSON
 
-Recalls = Mapping[str, tuple[float, ...]]  # of each condition at each threshold, percent
+Recalls = Mapping[str, tuple[float, ...]]  # condition -> percent at each threshold
 
 
 def measure(dataset: str, seed: int, workspace: Path, arguments: Sequence[str]) -> Recalls:
-    """Recall of a twin with one seed; the workspace keeps what no seed changes."""
+    """Measure the recall of a twin with one seed; unaffected stages are reused."""
     seeds = [part for key in SEEDED for part in ("--set", f"{key}={seed}")]
     megloc("eval", dataset, "--workspace", str(workspace), *seeds, *arguments)
-    found = json.loads((workspace / "evaluation" / RECALL_JSON).read_text())
-    return {row["name"]: tuple(100 * at["recall"] for at in row["recall"]) for row in found["rows"]}
+    recall = json.loads((workspace / "evaluation" / RECALL_JSON).read_text())
+    return {
+        row["name"]: tuple(100 * at["recall"] for at in row["recall"]) for row in recall["rows"]
+    }
 
 
 def summary(recalls: Mapping[str, Sequence[Recalls]]) -> str:
-    """One row per twin and condition: least to greatest recall at each threshold."""
+    """Tabulate the range of the recall at each threshold per twin and condition."""
     rows: list[tuple[str, ...]] = [("twin", "condition", "seeds", "recall (%)")]
     for dataset, of_seeds in recalls.items():
         for condition in of_seeds[0]:

@@ -1,4 +1,4 @@
-"""What a run of the preset ``megloc`` must leave behind, read with kapture's own reader."""
+"""Artefacts of a run of the preset ``megloc``, read with kapture's reader."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from kapture.io.features import (
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.pipeline.plan import read_manifest
 
-# path of the artefact -> what is in it, in words; raises where it cannot be read
+# returns a description of the content of an artefact; raises if it is unreadable
 Reader = Callable[[Path], str]
 
 _FEATURES = {
@@ -39,8 +39,8 @@ class Artefact:
     Attributes
     ----------
     path : below the workspace.
-    content : what kapture, or the file's own reader, finds in it.
-    seconds : of the stage.
+    content : description, such as "18 images, 18 poses".
+    seconds : duration of the stage.
     """
 
     stage: str
@@ -50,32 +50,32 @@ class Artefact:
 
 
 def artefacts(workspace: Path) -> list[Artefact]:
-    """All artefacts of a finished run, in the order of the stages.
+    """Return all artefacts of a finished run in the order of the stages.
 
     Raises
     ------
-    FileNotFoundError : a stage has not run, or an artefact of it is missing; names it.
-    ValueError : one is empty.
+    FileNotFoundError : a stage has not run or an artefact is missing.
+    ValueError : an artefact is empty.
     """
-    found = []
-    for stage, wanted in _ARTEFACTS.items():
+    result = []
+    for stage, readers in _ARTEFACTS.items():
         manifest = read_manifest(workspace / "stages" / f"{stage}.json")
         if manifest is None:
             raise FileNotFoundError(f"{stage}: the stage has not run")
-        for name, read in wanted.items():
+        for name, read in readers.items():
             if not (workspace / name).exists():
                 raise FileNotFoundError(f"{stage}: {name} is missing")
-            found.append(Artefact(stage, name, read(workspace / name), manifest.seconds))
-    return found
+            result.append(Artefact(stage, name, read(workspace / name), manifest.seconds))
+    return result
 
 
 def read_features(root: Path, sensors_of: tuple[Path, ...]) -> dict[str, int]:
-    """Rows of each kind and type of features in a features folder, as kapture reads them.
+    """Count the rows that kapture reads for each kind and type of features.
 
     Parameters
     ----------
-    root : in kapture-localization's layout, ``local_features/T/keypoints`` and so on.
-    sensors_of : kapture folders with the images.
+    root : folder in kapture-localization's layout, e.g. ``local_features/T/keypoints``.
+    sensors_of : kapture folders that contain the images.
     """
     with tempfile.TemporaryDirectory(prefix="megloc-proxy-") as temporary:
         proxy = Path(temporary)
@@ -90,7 +90,7 @@ def read_features(root: Path, sensors_of: tuple[Path, ...]) -> dict[str, int]:
 
 
 def _write_records(proxy: Path, sensors_of: tuple[Path, ...]) -> None:
-    """The records of several folders in one, which kapture wants before it reads features."""
+    """Merge the records of several folders; kapture requires them to read features."""
     data = KaptureData()
     for folder in sensors_of:
         read = KaptureFolder(folder).read()
@@ -100,21 +100,22 @@ def _write_records(proxy: Path, sensors_of: tuple[Path, ...]) -> None:
 
 
 def _rows(proxy: Path) -> dict[str, int]:
-    place, data, found = str(proxy), kapture_from_dir(str(proxy)), {}
+    root, data = str(proxy), kapture_from_dir(str(proxy))
+    rows = {}
     for name, images in (data.keypoints or {}).items():
-        found[f"{name} keypoints"] = sum(
+        rows[f"{name} keypoints"] = sum(
             len(
                 image_keypoints_from_file(
-                    get_keypoints_fullpath(name, place, image), images.dtype, images.dsize
+                    get_keypoints_fullpath(name, root, image), images.dtype, images.dsize
                 )
             )
             for image in images
         )
     for name, images in (data.descriptors or {}).items():
-        found[f"{name} descriptors"] = sum(
+        rows[f"{name} descriptors"] = sum(
             len(
                 image_descriptors_from_file(
-                    get_descriptors_fullpath(name, place, image), images.dtype, images.dsize
+                    get_descriptors_fullpath(name, root, image), images.dtype, images.dsize
                 )
             )
             for image in images
@@ -122,16 +123,16 @@ def _rows(proxy: Path) -> dict[str, int]:
     for name, images in (data.global_features or {}).items():
         vectors = [
             image_global_features_from_file(
-                get_global_features_fullpath(name, place, image), images.dtype, images.dsize
+                get_global_features_fullpath(name, root, image), images.dtype, images.dsize
             )
             for image in images
         ]
-        found[f"{name} vectors"] = len(vectors)
+        rows[f"{name} vectors"] = len(vectors)
     for name, pairs in (data.matches or {}).items():
-        found[f"{name} matches"] = sum(
-            len(image_matches_from_file(get_matches_fullpath(pair, name, place))) for pair in pairs
+        rows[f"{name} matches"] = sum(
+            len(image_matches_from_file(get_matches_fullpath(pair, name, root))) for pair in pairs
         )
-    return found
+    return rows
 
 
 def _folder(path: Path) -> str:
@@ -141,7 +142,7 @@ def _folder(path: Path) -> str:
         counts["depth maps"] = len(data.records_depth.data_list())
     if data.trajectories is not None:
         counts["poses"] = len(list(data.trajectories.key_pairs()))
-    return _told(counts)
+    return _text(counts)
 
 
 def _map(path: Path) -> str:
@@ -155,18 +156,13 @@ def _features(path: Path) -> str:
     workspace = next(parent for parent in path.parents if (parent / "stages").is_dir())
     sensors = tuple(workspace / "preprocessed" / part for part in ("mapping", "query"))
     root = path.parent if path.name in _FEATURES else path
-    found = read_features(root, sensors)
-    kept = {name: rows for name, rows in found.items() if _is_of(path, name)}
-    if not kept:
-        raise ValueError(f"{path}: kapture finds no features in it")
-    return _told(kept)
-
-
-def _is_of(path: Path, name: str) -> bool:
-    """Whether rows belong to a folder that stands beside the other kind of features."""
-    if path.name not in _FEATURES:
-        return True
-    return name.endswith("vectors") == (path.name == "global_features")
+    counts = read_features(root, sensors)
+    if path.name in _FEATURES:  # the root also contains the other kind of features
+        is_global = path.name == "global_features"
+        counts = {name: n for name, n in counts.items() if name.endswith("vectors") == is_global}
+    if not counts:
+        raise ValueError(f"{path}: kapture reads no features")
+    return _text(counts)
 
 
 def _table(path: Path) -> str:
@@ -182,13 +178,13 @@ def _pairs(path: Path) -> str:
 
 def _file(path: Path) -> str:
     if path.is_dir():
-        return f"{sum(1 for each in path.rglob('*') if each.is_file())} files"
+        return f"{sum(1 for file in path.rglob('*') if file.is_file())} files"
     if path.stat().st_size == 0:
-        raise ValueError(f"{path}: is empty")
+        raise ValueError(f"{path} is empty")
     return f"{path.stat().st_size} bytes"
 
 
-def _told(counts: dict[str, int]) -> str:
+def _text(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 

@@ -1,8 +1,7 @@
-"""A small rendered scene on which every stage of the preset ``megloc`` has something to do.
+"""A small rendered scene that exercises every stage of the preset ``megloc``.
 
-The rendered world as plain kapture, and of the queries depth as well: the map's cameras are a rig
-on a round, with depth and with masks of the car's bonnet; the queries are telephones with lens
-distortion whose depth lets them be refined by ICP.
+The map images are from a rig on a circular trajectory and have depth and ego-vehicle masks. The
+queries are from phones with lens distortion, and have depth for refinement by ICP.
 """
 
 from __future__ import annotations
@@ -30,20 +29,19 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_
 from megloc_kapture.io.tables import STATUS_FILE, write_status
 from megloc_kapture.values import LocalizationResult, RigidTransform
 
-_STEP_M = 0.3  # to the side, between the images of a stop
-_BESIDE_M = (-0.15, 0.05, 0.0)  # of a query that is taken beside a map image, in its frame
+_STEP_M = 0.3  # lateral distance between the images of a stop
+_QUERY_OFFSET_M = (-0.15, 0.05, 0.0)  # from a map image to its query, in the camera frame
 _DISPLACED_M = 0.05
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is rendered.
+    """Options of the rendered scene.
 
     Attributes
     ----------
-    world : the rendered world.
-    steps : images that each of the rig's cameras takes at a stop, 30 cm from one to the next.
-    beside : queries are taken 15 cm beside map images, not anywhere.
+    steps : images per camera and stop, 30 cm apart.
+    beside : place each query 15 cm from a map image instead of at a random pose.
     """
 
     world: SyntheticWorldOptions
@@ -64,7 +62,7 @@ FREE_SCENE = Scene(
         masks=True,
     )
 )
-# what random networks see of a place changes with every step: they match views that are near
+# random networks match nearby views only
 RANDOM_SCENE = Scene(
     FREE_SCENE.world.model_copy(
         update={"stations_per_place": 3, "day_queries": 4, "width": 320, "height": 240}
@@ -75,11 +73,11 @@ RANDOM_SCENE = Scene(
 
 
 def write_scene(root: Path, scene: Scene) -> None:
-    """Draw the scene and write mapping/, query/, query_gt/ and megloc/ below ``root``."""
+    """Render the scene and write mapping/, query/, query_gt/ and megloc/ below ``root``."""
     world = build_world(scene.world)
     world = _stepped(world, scene.steps)
     if scene.beside:
-        world = _queries_beside(world)
+        world = _queries_near_map(world)
     names = [shot.name for shot in world.frames()]
     render_frames(
         world.options, world.frames(), partial(write_files, root, world.options), with_depth=names
@@ -91,12 +89,12 @@ def write_scene(root: Path, scene: Scene) -> None:
 
 
 def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:
-    """The world whose rig takes several images at each stop, side by side."""
+    """Return the world with several laterally displaced images per stop."""
     mapping, rig_from_world = [], {}
     for shot in world.mapping:
         for step in range(steps):
-            aside = RigidTransform((1.0, 0.0, 0.0, 0.0), (-_STEP_M * step, 0.0, 0.0))
-            pose = aside @ world.rig_from_world[shot.timestamp]
+            offset = RigidTransform((1.0, 0.0, 0.0, 0.0), (-_STEP_M * step, 0.0, 0.0))
+            pose = offset @ world.rig_from_world[shot.timestamp]
             timestamp = shot.timestamp * steps + step
             rig_from_world[timestamp] = pose
             stem, _, ending = shot.name.rpartition(".")
@@ -113,35 +111,31 @@ def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:
     return replace(world, mapping=tuple(mapping), rig_from_world=rig_from_world)
 
 
-def _queries_beside(world: SyntheticWorld) -> SyntheticWorld:
-    """The world whose queries stand beside map images, spread over all of them."""
+def _queries_near_map(world: SyntheticWorld) -> SyntheticWorld:
+    """Return the world with its queries next to evenly sampled map images."""
     every = len(world.mapping) // max(len(world.queries), 1)
-    beside = RigidTransform((1.0, 0.0, 0.0, 0.0), _BESIDE_M)
+    offset = RigidTransform((1.0, 0.0, 0.0, 0.0), _QUERY_OFFSET_M)
     queries = [
-        replace(query, place=near.place, cam_from_world=beside @ near.cam_from_world)
+        replace(query, place=near.place, cam_from_world=offset @ near.cam_from_world)
         for query, near in zip(world.queries, world.mapping[1::every], strict=False)
     ]
     return replace(world, queries=tuple(queries))
 
 
 def _with_depth(data: KaptureData) -> KaptureData:
-    """Records of queries, with a depth sensor in the place of each one's camera."""
+    """Add a depth sensor at the pose of each camera."""
     for (timestamp, sensor), image in data.records_camera.items():
         depth = f"{sensor}_depth"
         camera = data.sensors[sensor].camera()
         data.sensors[depth] = Sensor.from_camera(camera, name=depth, sensor_type="depth")
-        still = RigidTransform.identity()
-        data.rigs[f"{sensor}_rig"] = {sensor: still, depth: still}
+        identity = RigidTransform.identity()
+        data.rigs[f"{sensor}_rig"] = {sensor: identity, depth: identity}
         data.records_depth[timestamp, depth] = depth_name(image)
     return data
 
 
 def write_displaced_truth(query: KaptureFolder, truth: KaptureFolder, output: Path) -> int:
-    """Write the true poses, each moved by 5 cm, as if they had been estimated.
-
-    Parameters
-    ----------
-    query : images that the result refers to.
+    """Write the true poses of ``query``, displaced by 5 cm, as a localization result.
 
     Returns
     -------

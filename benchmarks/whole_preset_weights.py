@@ -1,13 +1,12 @@
-"""Random weights for the preset ``megloc``, in files as they are published or converted.
+"""Random weights for the preset ``megloc``, in the published or converted file formats.
 
     .venv/bin/python benchmarks/whole_preset_weights.py DIR
     MEGLOC_WEIGHTS=DIR make eval DATASET=synthetic-aachen PRESET=megloc
 
-Every file has the official or the converted name, and its keys and shapes; the numbers are drawn
-from a seed.
-Where torch's own way to begin a network would let nothing through (a score map that is flat, a
-graph that drowns the descriptors), the numbers are scaled so that features still answer to texture
-and matches to descriptors: then every stage after them has something to do.
+Each file has the official or converted name, keys and shapes; the values are drawn from a seed.
+Where torch's default initialization gives degenerate outputs (a flat score map, a graph network
+whose updates dominate the descriptors), the values are rescaled so that features respond to texture
+and matches to descriptors, and the later stages get useful inputs.
 """
 
 from __future__ import annotations
@@ -38,19 +37,19 @@ from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.preprocessing.deeplab import DeepLabV3Plus
 
 _MEAN_RGB = (123.68, 116.779, 103.939)
-_STANDING_CLASSES = 11  # of Cityscapes, before person, rider and the vehicles
-# how sharply SuperGlue tells similar descriptors apart, and the cosine that the dustbin has
+_STATIC_CLASSES = 11  # of Cityscapes; they precede person, rider and the vehicles
+# sharpness of the matching scores, and cosine similarity equivalent to the dustbin score
 _SHARPNESS, _DUSTBIN_COSINE = 30.0, 0.6
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What may be smaller than published; the readers take the sizes from the files.
+    """Layer sizes that may differ from the published ones; readers take them from the files.
 
     Attributes
     ----------
-    clusters, whitened : of NetVLAD and OpenIBL, whose whitenings are half a gigabyte each.
-    hidden : units of AlexNet's classifier, which is most of its file and which nobody reads.
+    clusters, whitened : sizes of NetVLAD and OpenIBL, whose whitenings take half a gigabyte each.
+    hidden : units of AlexNet's classifier, the largest part of its file, which is not used.
     """
 
     clusters: int = 64
@@ -67,12 +66,11 @@ def write_random_weights(
     sizes: Sizes = OFFICIAL,
     names: Collection[str] = (),
 ) -> dict[str, Path]:
-    """Write one file per network, and return them by the networks' names in the registry.
+    """Write one file per network; return the paths by registry name.
 
-    ``names`` replaces the networks of the preset ``megloc``; it may have those of the free networks
-    (``FREE_NETWORKS``).
+    ``names`` selects networks of the preset ``megloc`` (default: all) or of ``FREE_NETWORKS``.
     """
-    found = {}
+    paths = {}
     for name in names or _WRITERS:
         write = _WRITERS.get(name) or _FREE_WRITERS[name]
         path = folder / _official_name(name)
@@ -80,19 +78,19 @@ def write_random_weights(
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             torch.manual_seed(crc32(f"{seed}/{name}".encode()))
             write(path, sizes)
-        found[name] = path
-    return found
+        paths[name] = path
+    return paths
 
 
 def _official_name(name: str) -> str:
-    """The published file that is read as it is, or the converted one."""
+    """Return the name of the published file, or of the converted file if that one is read."""
     names = [file.name for file in registry()[name].files if not file.convert]
     return names[0] if names else registry()[name].converted
 
 
 def _superpoint(path: Path, _: Sizes) -> None:
-    net = _spread(SuperPointNet())
-    # descriptors around zero: else those of all keypoints are alike
+    net = _kaiming(SuperPointNet())
+    # centre the descriptors; otherwise those of all keypoints are similar
     gray = nn.functional.interpolate(torch.rand(1, 1, 40, 40), scale_factor=4, mode="bilinear")
     features = torch.relu(net.convDa(net.encode(gray)))
     net.convDb.bias.sub_(net.convDb(features).mean((0, 2, 3)))
@@ -102,12 +100,12 @@ def _superpoint(path: Path, _: Sizes) -> None:
 def _superglue(path: Path, _: Sizes) -> None:
     net = SuperGlueNet()
     for key, value in net.named_parameters():
-        # what is added to the descriptors: by their places, and by each layer of the graph
+        # updates of the descriptors, by the positional encoding and by each layer
         if key.startswith("kenc.encoder.12.") or ".mlp.3." in key:
             value.mul_(0.01)
     size = net.descriptor_size
-    turned = nn.init.orthogonal_(torch.empty(size, size))
-    net.final_proj.weight.copy_((_SHARPNESS**0.5 * size**0.25) * turned[:, :, None])
+    rotation = nn.init.orthogonal_(torch.empty(size, size))
+    net.final_proj.weight.copy_((_SHARPNESS**0.5 * size**0.25) * rotation[:, :, None])
     net.bin_score.fill_(_SHARPNESS * _DUSTBIN_COSINE)
     torch.save(net.state_dict(), path)
 
@@ -118,14 +116,14 @@ def _aslfeat(path: Path, _: Sizes) -> None:
 
 
 def _aslfeat_values(key: str, value: torch.Tensor) -> torch.Tensor:
-    drawn = torch.randn(value.shape)
+    normal = torch.randn(value.shape)
     if key.startswith("deform_param."):
-        return 0.02 * drawn
+        return 0.02 * normal
     if value.ndim == 4:
-        return drawn * (2 / value[0].numel()) ** 0.5
+        return normal * (2 / value[0].numel()) ** 0.5
     if key.endswith("running_mean"):
-        return 0.1 * drawn
-    return drawn.abs() / 2 + (2.0 if key.endswith("instance_max") else 0.5)
+        return 0.1 * normal
+    return normal.abs() / 2 + (2.0 if key.endswith("instance_max") else 0.5)
 
 
 def _netvlad(path: Path, sizes: Sizes) -> None:
@@ -141,7 +139,7 @@ def _vgg_netvlad(sizes: Sizes) -> VggNetVlad:
     net = VggNetVlad(
         order="kd", mean_rgb=_MEAN_RGB, num_clusters=sizes.clusters, output_size=sizes.whitened
     )
-    _spread(net.base_model)
+    _kaiming(net.base_model)
     net.net_vlad.conv.weight.normal_(0, 20.0)
     net.net_vlad.centroids.normal_(0, 0.02)
     return net
@@ -166,7 +164,7 @@ def _delg_values(key: str, value: torch.Tensor) -> torch.Tensor:
 
 def _apgem(path: Path, _: Sizes) -> None:
     net = ApGemNet(101)
-    net.fc.bias.zero_()  # which would be most of a vector of random weights
+    net.fc.bias.zero_()  # a random bias would dominate the descriptor
     whitening = {
         "mean": 0.001 * torch.randn(2048),
         "components": torch.randn(2048, 2048) / 45,
@@ -178,7 +176,7 @@ def _apgem(path: Path, _: Sizes) -> None:
 
 
 def _lpips_trunk(path: Path, sizes: Sizes) -> None:
-    state = _lpips_state(lambda key: key.startswith("features."))
+    state = _lpips_state("features.")
     inputs = 256 * 6 * 6
     for layer, outputs in ((1, sizes.hidden), (4, sizes.hidden), (6, 1000)):
         state[f"classifier.{layer}.weight"] = torch.randn(outputs, inputs)
@@ -188,38 +186,40 @@ def _lpips_trunk(path: Path, sizes: Sizes) -> None:
 
 
 def _lpips_heads(path: Path, _: Sizes) -> None:
-    state = _lpips_state(lambda key: key.startswith("lin"))
+    state = _lpips_state("lin")
     torch.save({key: value.abs() for key, value in state.items()}, path)
 
 
-def _lpips_state(wanted: Callable[[str], bool]) -> dict[str, torch.Tensor]:
-    state = _spread(Lpips("alex")).state_dict()
-    return {key: value for key, value in state.items() if wanted(key)}
+def _lpips_state(prefix: str) -> dict[str, torch.Tensor]:
+    state = _kaiming(Lpips("alex")).state_dict()
+    return {key: value for key, value in state.items() if key.startswith(prefix)}
 
 
 def _deeplab(path: Path, _: Sizes) -> None:
-    net = _spread(DeepLabV3Plus("resnet101", num_classes=19))
-    # random labels stand still, so that masks leave something of the images
+    net = _kaiming(DeepLabV3Plus("resnet101", num_classes=19))
+    # favour static classes, so that the masks keep part of each image
     logits = net.eval()(torch.rand(1, 3, 129, 161))
-    net.get_parameter("classifier.classifier.3.bias")[:_STANDING_CLASSES].add_(2.0 * logits.std())
+    net.get_parameter("classifier.classifier.3.bias")[:_STATIC_CLASSES].add_(2.0 * logits.std())
     state = {"model_state": net.state_dict(), "cur_itrs": 30_000, "best_score": np.float64(0.7)}
     torch.save(state, path)
 
 
 def _aliked(path: Path, _: Sizes) -> None:
-    torch.save(_spread(AlikedNet((16, 32, 64, 128), positions=16)).state_dict(), path)
+    torch.save(_kaiming(AlikedNet((16, 32, 64, 128), positions=16)).state_dict(), path)
 
 
 def _r2d2(path: Path, _: Sizes) -> None:
-    net = _spread(R2D2Network())
-    net.sal.bias.fill_(1.0)  # else few pixels are repeatable and reliable enough
+    net = _kaiming(R2D2Network())
+    net.sal.bias.fill_(
+        1.0
+    )  # otherwise few pixels pass the repeatability and reliability thresholds
     net.clf.bias.copy_(torch.tensor([-1.0, 1.0]))
     state = {f"module.{key}": value for key, value in net.state_dict().items()}
     torch.save({"net": "Quad_L2Net_ConfCFS()", "state_dict": state}, path)
 
 
 def _xfeat(path: Path, _: Sizes) -> None:
-    torch.save(_spread(_kornia("XFeat").net).state_dict(), path)
+    torch.save(_kaiming(_kornia("XFeat").net).state_dict(), path)
 
 
 def _disk(path: Path, _: Sizes) -> None:
@@ -228,12 +228,12 @@ def _disk(path: Path, _: Sizes) -> None:
 
 def _lightglue(path: Path, _: Sizes) -> None:
     net = _kornia("LightGlue", None, flash=False)
-    for layer in net.transformers:  # so that descriptors are not drowned
+    for layer in net.transformers:  # keep updates small relative to the descriptors
         for block in (layer.self_attn, layer.cross_attn):
             block.ffn[-1].weight.mul_(0.1)
     for head in net.log_assignment:
-        turned = nn.init.orthogonal_(torch.empty(256, 256))
-        head.final_proj.weight.copy_((_SHARPNESS**0.5 * 4) * turned)
+        rotation = nn.init.orthogonal_(torch.empty(256, 256))
+        head.final_proj.weight.copy_((_SHARPNESS**0.5 * 4) * rotation)
         head.final_proj.bias.zero_()
         head.matchability.bias.fill_(3.0)
     state = {
@@ -277,8 +277,8 @@ _WRITERS: dict[str, Callable[[Path, Sizes], None]] = {
 }
 
 
-def _spread(net: nn.Module) -> Any:
-    """He's way to begin: what a layer gives has the size of what it is given."""
+def _kaiming(net: nn.Module) -> Any:
+    """Initialize the weights by He et al., so that activations keep their magnitude."""
     for value in net.parameters():
         if value.ndim > 2:
             nn.init.kaiming_normal_(value)
@@ -286,9 +286,8 @@ def _spread(net: nn.Module) -> Any:
 
 
 def main() -> None:
-    """Write all of them where ``megloc`` finds what is not the published file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="of weights, for MEGLOC_WEIGHTS; 2.5 GB")
+    parser.add_argument("folder", type=Path, help="weights folder for MEGLOC_WEIGHTS; 2.5 GB")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--small", action="store_true", help="smaller whitenings and classifiers")
     options = parser.parse_args()

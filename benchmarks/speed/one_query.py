@@ -1,16 +1,17 @@
-"""One photograph in a warm ``Localizer``: candidates in turn beside all of them.
+"""Time one photograph in a warm ``Localizer``: all candidates, or candidates in turn.
 
     .venv/bin/python benchmarks/speed/one_query.py --map WORKSPACE/map --scene SCENE
 
-The map is that of ``megloc eval kapture --root SCENE --workspace WORKSPACE``; the scene has query/
-and query_gt/. Processor time is of one thread; the first query of each row is not counted.
+The map is created by ``megloc eval kapture --root SCENE --workspace WORKSPACE``; the scene has
+query/ and query_gt/. Times are CPU seconds of one thread; the first query of each row is not
+counted.
 """
 
 from __future__ import annotations
 
 import os
 
-# before numpy is imported: after that it is too late
+# has no effect after the import of numpy
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import argparse  # noqa: E402
@@ -29,7 +30,7 @@ THRESHOLDS = [Threshold.parse(text) for text in ("0.05,5", "0.25,2", "0.5,5", "5
 
 
 def measure(name: str, map_folder: Path, scene: Path, preset: str, sure: str) -> list[str]:
-    """Localize all queries of a scene, and return a row of the table."""
+    """Localize all queries of a scene; return a row of the table."""
     options = options_of_preset(
         preset,
         assignments=["localization.min_confidence=0", f"localization.sure_confidence={sure}"],

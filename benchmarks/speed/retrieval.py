@@ -1,14 +1,14 @@
-"""Retrieval from kapture's files: ours, the bare matrix product and kapture-localization's tool.
+"""Compare retrieval from kapture's files with a matrix product and kapture-localization.
 
     .venv/bin/python benchmarks/speed/retrieval.py [--million]
 
-The top 50 of 1,000 queries in 10,000 images of 4096 dimensions, from the vectors in the page cache:
-in one tar, and as one file per image. The product has its vectors in memory and knows no order; it
-is what no search can do without. All run in turn in this process, several times over, on the same
-threads. Two lengths are measured of ours and of kapture-localization: the search alone, from the
-opening of the vectors to the ranking, and the whole tool, from the kapture folders to the pairs
-file. The pairs of all are compared. ``--million`` searches a million vectors that are made block by
-block, in a process of its own, and prints the memory that took.
+Task: the top 50 of 1,000 queries in 10,000 images with 4096 dimensions. The vectors are in the page
+cache, either in one tar or in one file per image. The matrix product alone, from memory and without
+ranking, is the lower bound of an exact search. All methods run alternately in this process with the
+same threads. Ours and kapture-localization are timed for the search alone (from opening the vectors
+to the ranking) and for the whole tool (from kapture folders to the pairs file), and their pairs are
+compared. ``--million`` searches a million vectors, generated in blocks, in a separate process and
+prints the peak memory.
 """
 
 from __future__ import annotations
@@ -56,8 +56,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 TYPE = "generated"
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
-HERE = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-SAME = 1e-6  # scores of one pair may differ by this
+SCORE_TOLERANCE = 1e-6
 MILLION = 1_000_000
 Vectors = NDArray[np.float32]
 Pairs = dict[str, dict[str, float]]
@@ -66,7 +65,7 @@ Pairs = dict[str, dict[str, float]]
 def random_vectors(
     seed: Sequence[int], count: int, dimension: int, out: Vectors | None = None
 ) -> Vectors:
-    """Unit rows (count, dimension)."""
+    """Generate random unit vectors (count, dimension)."""
     rng = np.random.default_rng(seed)
     rows: Vectors = rng.standard_normal((count, dimension), dtype=np.float32, out=out)
     rows /= np.sqrt(np.vecdot(rows, rows))[:, None]
@@ -81,13 +80,13 @@ def generate(
     *,
     tar: bool,
 ) -> None:
-    """A kapture folder with global features; nothing is done where there is one."""
+    """Write a kapture folder with global features unless it exists."""
     if (folder / "complete").exists():
         return
     data = KaptureData(sensors={"camera": Sensor.from_camera(CAMERA)})
     for timestamp, name in enumerate(names):
         data.records_camera[timestamp, "camera"] = name
-        data.trajectories[timestamp, "camera"] = HERE
+        data.trajectories[timestamp, "camera"] = RigidTransform.identity()
     write_sensors(folder, data)
     config = FeatureConfig(TYPE, np.dtype("float32"), dimension, None, "L2")
     with FeatureWriter(folder, "global_features", TYPE, config) as writer:
@@ -100,7 +99,7 @@ def generate(
 
 
 def pack(folder: Path) -> None:
-    """Move the global features of a type's folder into a tar, as kapture keeps large sets."""
+    """Move the global features of a folder into a tar, kapture's format for large sets."""
     with tarfile.open(folder / "global_features.tar", "w") as tar:
         for path in sorted(folder.rglob("*.gfeat")):
             tar.add(path, path.relative_to(folder))
@@ -111,7 +110,7 @@ def pack(folder: Path) -> None:
 
 
 class Ours:
-    """Our search of one form of the files."""
+    """Our search in one file layout."""
 
     def __init__(self, mapping: Path, query: Path, top_k: int) -> None:
         self.mapping, self.query, self.top_k = mapping, query, top_k
@@ -119,11 +118,11 @@ class Ours:
         self.queries = KaptureFolder(query).read().image_names()
 
     def search(self) -> None:
-        """From the opening of the vectors to the ranking."""
+        """Search, from opening the vectors to the ranking."""
         self._search(self.images, self.queries)
 
     def tool(self, path: Path) -> None:
-        """From kapture folders to the pairs file."""
+        """Run from kapture folders to the pairs file."""
         images = sorted(KaptureFolder(self.mapping).read().poses())
         queries = KaptureFolder(self.query).read().image_names()
         indices, scores = self._search(images, queries)
@@ -136,18 +135,18 @@ class Ours:
         write_pairs(path, pairs)
 
     def _search(self, images: Sequence[str], queries: Sequence[str]) -> Any:
-        of_map = KaptureVectors(KaptureFolder(self.mapping).global_features(TYPE), images)
-        of_queries = KaptureVectors(KaptureFolder(self.query).global_features(TYPE), queries)
+        map_vectors = KaptureVectors(KaptureFolder(self.mapping).global_features(TYPE), images)
+        query_vectors = KaptureVectors(KaptureFolder(self.query).global_features(TYPE), queries)
         search = FusedSearch(self.top_k, FusionOptions())
-        return search.lists([of_queries.read(0, len(queries))], [of_map])[0]
+        return search.lists([query_vectors.read(0, len(queries))], [map_vectors])[0]
 
 
 def pairs_of(path: Path) -> Pairs:
-    """The pairs of a pairs file and their scores, by query."""
-    found: Pairs = {}
+    """Read the scores of a pairs file by query and map image."""
+    pairs: Pairs = {}
     for pair in read_pairs(path):
-        found.setdefault(pair.query, {})[pair.map] = pair.score
-    return found
+        pairs.setdefault(pair.query, {})[pair.map] = pair.score
+    return pairs
 
 
 # ---------------------------------------------------------------------------- kapture-localization
@@ -158,12 +157,12 @@ class Theirs:
 
     def __init__(self, mapping: Path, query: Path, top_k: int) -> None:
         script = tool_scripts()["kapture_compute_image_pairs"]
-        sys.path.append(str(script.parent))  # what the script imports lies beside it
+        sys.path.append(str(script.parent))  # the script imports modules of its folder
         self._tool: Callable[..., None] = runpy.run_path(str(script))["compute_image_pairs"]
         self.mapping, self.query, self.top_k = str(mapping), str(query), top_k
 
     def search(self) -> None:
-        """The tool's own steps, without the tables of the kapture folders and the pairs file."""
+        """Run the steps of the tool without reading kapture tables and writing pairs."""
         import kapture
         from kapture.io.csv import get_all_tar_handlers, global_features_config_from_file
         from kapture.io.csv import global_features_from_dir as from_folder
@@ -175,10 +174,10 @@ class Theirs:
             with get_all_tar_handlers(folder) as handlers:
                 features = from_folder(TYPE, folder, None, handlers)
                 paths = global_features_to_filepaths(features, TYPE, folder, handlers)
-                place = kapture.io.csv.get_feature_csv_fullpath(
+                csv_path = kapture.io.csv.get_feature_csv_fullpath(
                     kapture.GlobalFeatures, TYPE, folder
                 )
-                config = global_features_config_from_file(place)
+                config = global_features_config_from_file(csv_path)
                 stacked.append(pairing.stack_global_features(config, sorted(paths.items())))
         similarity = pairing.get_similarity(stacked[1], stacked[0])
         pairing.get_image_pairs(similarity, self.top_k)
@@ -197,8 +196,8 @@ def timed(work: Callable[[], Any]) -> float:
 
 
 def compared(ours: Pairs, theirs: Pairs) -> str:
-    """Whether the pairs are the same; one that only one has may have the score of the last."""
-    same, largest, level = 0, 0.0, 0
+    """Describe the difference of the pairs; pairs tied with the last score may differ."""
+    same, largest, ties = 0, 0.0, 0
     for query in sorted(ours.keys() | theirs.keys()):
         a, b = ours.get(query, {}), theirs.get(query, {})
         last = min([*a.values(), *b.values()])
@@ -206,13 +205,13 @@ def compared(ours: Pairs, theirs: Pairs) -> str:
             if image in a and image in b:
                 same += 1
                 largest = max(largest, abs(a[image] - b[image]))
-            elif abs({**a, **b}[image] - last) <= SAME:
-                level += 1
+            elif abs({**a, **b}[image] - last) <= SCORE_TOLERANCE:
+                ties += 1
             else:
                 return f"PAIRS DIFFER: {query} with {image}"
-    if largest > SAME:
+    if largest > SCORE_TOLERANCE:
         return f"SCORES DIFFER by {largest:.1e}"
-    return f"{same} pairs equal, {level} of equal score differ, scores within {largest:.1e}"
+    return f"{same} pairs equal, {ties} of equal score differ, scores within {largest:.1e}"
 
 
 def measure(options: argparse.Namespace) -> bool:
@@ -220,67 +219,70 @@ def measure(options: argparse.Namespace) -> bool:
     query_names = [f"query/{k:05d}.jpg" for k in range(options.queries)]
     vectors = random_vectors([0], len(names), options.dimension)
     queries = random_vectors([1], len(query_names), options.dimension)
-    forms = {"tar": True, "files": False}
+    layouts = {"tar": True, "files": False}
     root = options.cache / f"retrieval_{options.images}_{options.queries}_{options.dimension}"
-    works: dict[str, Callable[[], Any]] = {"bare matrix product": lambda: queries @ vectors.T}
+    methods: dict[str, Callable[[], Any]] = {"bare matrix product": lambda: queries @ vectors.T}
     pairs: dict[str, Callable[[], Pairs]] = {}
     folder = root / "pairs"
     folder.mkdir(parents=True, exist_ok=True)
     installed = True
-    for form, tar in forms.items():
-        mapping, query = root / form / "map", root / form / "query"
+    for layout, tar in layouts.items():
+        mapping, query = root / layout / "map", root / layout / "query"
         generate(mapping, names, vectors, options.dimension, tar=tar)
         generate(query, query_names, queries, options.dimension, tar=tar)
         ours = Ours(mapping, query, options.top_k)
-        works[f"ours, {form}, search"] = ours.search
-        works[f"ours, {form}, whole tool"] = partial(ours.tool, folder / f"ours_{form}.txt")
-        pairs[f"ours, {form}"] = partial(pairs_of, folder / f"ours_{form}.txt")
+        file = folder / f"ours_{layout}.txt"
+        methods[f"ours, {layout}, search"] = ours.search
+        methods[f"ours, {layout}, whole tool"] = partial(ours.tool, file)
+        pairs[f"ours, {layout}"] = partial(pairs_of, file)
         try:
             theirs = Theirs(mapping, query, options.top_k)
         except OptionError as error:
             print(error)
             installed = False
             continue
-        works[f"kapture-localization, {form}, search"] = theirs.search
-        file = folder / f"theirs_{form}.txt"
-        works[f"kapture-localization, {form}, whole tool"] = partial(theirs.tool, file)
-        pairs[f"kapture-localization, {form}"] = partial(pairs_of, file)
-    seconds: dict[str, list[float]] = {name: [] for name in works}
+        file = folder / f"theirs_{layout}.txt"
+        methods[f"kapture-localization, {layout}, search"] = theirs.search
+        methods[f"kapture-localization, {layout}, whole tool"] = partial(theirs.tool, file)
+        pairs[f"kapture-localization, {layout}"] = partial(pairs_of, file)
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
     for repetition in range(options.repetitions + 1):
-        for name, work in works.items():
-            with contextlib.redirect_stderr(None):  # a progress bar
-                spent = timed(work)
-            if repetition:  # the first fills the page cache and compiles
+        for name, method in methods.items():
+            with contextlib.redirect_stderr(None):  # hides a progress bar
+                spent = timed(method)
+            if repetition:  # the first is a warm-up
                 seconds[name].append(spent)
     product = float(np.median(seconds["bare matrix product"]))
     rows = [("", "median s", "min s", "of product")]
-    for name, each in seconds.items():
-        median = float(np.median(each))
-        rows.append((name, f"{median:.3f}", f"{min(each):.3f}", f"{median / product:.2f}"))
+    for name, values in seconds.items():
+        median = float(np.median(values))
+        rows.append((name, f"{median:.3f}", f"{min(values):.3f}", f"{median / product:.2f}"))
     print(table(rows))
 
     def ratio(a: str, b: str) -> float:
         return float(np.median(seconds[a]) / np.median(seconds[b]))
 
     checks = [
-        ("search of the tar by the bare product", "ours, tar, search", "bare matrix product", 1.9),
-        ("search of files by search of the tar", "ours, files, search", "ours, tar, search", 2.0),
+        ("search of the tar / matrix product", "ours, tar, search", "bare matrix product", 1.9),
+        ("search of files / search of the tar", "ours, files, search", "ours, tar, search", 2.0),
     ]
     if installed:
         for part in ("search", "whole tool"):
             name = f"tar, {part}"
             theirs_name = f"kapture-localization, {name}"
-            checks.append((f"{name}, by kapture-localization's", f"ours, {name}", theirs_name, 0.5))
+            checks.append(
+                (f"{name}: ours / kapture-localization", f"ours, {name}", theirs_name, 0.5)
+            )
     met = True
-    for what, a, b, most in checks:
-        found = ratio(a, b)
-        met &= found <= most
-        print(f"{what}: {found:.2f} (at most {most:g}{'' if found <= most else ': MISSED'})")
+    for label, a, b, limit in checks:
+        value = ratio(a, b)
+        met &= value <= limit
+        print(f"{label}: {value:.2f} (at most {limit:g}{'' if value <= limit else ': MISSED'})")
     reference = pairs["ours, tar"]()
-    for name, found_pairs in pairs.items():
-        said = compared(reference, found_pairs())
-        met &= "DIFFER" not in said
-        print(f"ours, tar, and {name}: {said}")
+    for name, read in pairs.items():
+        difference = compared(reference, read())
+        met &= "DIFFER" not in difference
+        print(f"ours, tar, and {name}: {difference}")
     return met
 
 
@@ -288,7 +290,7 @@ def measure(options: argparse.Namespace) -> bool:
 
 
 class GeneratedVectors:
-    """Random unit rows, made when they are read; row ``k * spacing`` is near query k."""
+    """Random unit vectors, generated on reading; row ``k * spacing`` is near query k."""
 
     def __init__(self, length: int, queries: Vectors) -> None:
         self._length, self._queries = length, queries
@@ -304,15 +306,15 @@ class GeneratedVectors:
     def read(self, start: int, stop: int, out: Vectors | None = None) -> Vectors:
         rows = random_vectors([2, start], stop - start, self.dimension, out)
         for k in range(-(-start // self._spacing), len(self._queries)):
-            place = k * self._spacing
-            if place >= stop:
+            row = k * self._spacing
+            if row >= stop:
                 break
-            rows[place - start] = 0.6 * self._queries[k] + 0.8 * rows[place - start]
+            rows[row - start] = 0.6 * self._queries[k] + 0.8 * rows[row - start]
         return rows
 
 
 def million(options: argparse.Namespace) -> None:
-    """Print seconds, gigabytes and how many planted rows were found first."""
+    """Print the seconds, peak memory and number of planted rows ranked first."""
     queries = random_vectors([1], options.queries, options.dimension)
     database = GeneratedVectors(options.million_images, queries)
     start = time.perf_counter()
@@ -320,9 +322,9 @@ def million(options: argparse.Namespace) -> None:
     ((indices, _),) = search.lists([queries], [database])
     spent = time.perf_counter() - start
     planted = np.arange(len(queries)) * (len(database) // len(queries))
-    found = int((indices[:, 0] == planted).sum())
+    correct = int((indices[:, 0] == planted).sum())
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
-    print(json.dumps({"seconds": spent, "gib": memory, "found": found}))
+    print(json.dumps({"seconds": spent, "gib": memory, "correct": correct}))
 
 
 def main() -> int:
@@ -333,7 +335,7 @@ def main() -> int:
     parser.add_argument("--top-k", type=int, default=50)
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "megloc-bench")
-    parser.add_argument("--million", action="store_true", help="search generated vectors as well")
+    parser.add_argument("--million", action="store_true", help="also search generated vectors")
     parser.add_argument("--million-images", type=int, default=MILLION)
     parser.add_argument("--only-million", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -350,13 +352,13 @@ def main() -> int:
     if options.million:
         command = [sys.executable, __file__, *sys.argv[1:], "--only-million"]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
-        found = json.loads(done.stdout)
+        result = json.loads(done.stdout)
         print(
-            f"{options.million_images} generated vectors, made and searched: "
-            f"{found['seconds']:.0f} s, {found['gib']:.2f} GiB at most, "
-            f"{found['found']} of {options.queries} planted rows found first"
+            f"{options.million_images} vectors, generated and searched: "
+            f"{result['seconds']:.0f} s, peak {result['gib']:.2f} GiB, "
+            f"{result['correct']} of {options.queries} planted rows ranked first"
         )
-        met &= found["gib"] < 6 and found["found"] == options.queries
+        met &= result["gib"] < 6 and result["correct"] == options.queries
     return 0 if met else 1
 
 

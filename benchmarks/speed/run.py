@@ -1,6 +1,6 @@
-"""All speed measurements, each in a process of its own: what ``make bench`` runs.
+"""Run all speed benchmarks of ``make bench``, each in a separate process.
 
-Every script here also runs alone; see benchmarks/README.md.
+Each script also runs alone; see benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ HERE = Path(__file__).resolve().parent
 
 
 def run(script: str, *arguments: str) -> None:
-    """Run one script; a failure ends the run with its exit code."""
+    """Run one script; exit with its status on failure."""
     print(f"\n== {script} {' '.join(arguments)}".rstrip(), flush=True)
     done = subprocess.run([sys.executable, str(HERE / script), *arguments], check=False)
     if done.returncode != 0:

@@ -1,7 +1,7 @@
-"""A street of points, and the images of a car that looks to its left: maps of any size.
+"""Synthetic maps of any size: a street of points seen by a car's left-facing camera.
 
-Images follow each other at equal steps, and so do the points they see: the map is as long as it
-has images, and each point is seen by equally many.
+Images and the points they see advance in equal steps, so the length of the street is proportional
+to the number of images, and the number of images per point is constant.
 """
 
 from __future__ import annotations
@@ -17,22 +17,21 @@ from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("PINHOLE", 1600, 1200, (1000.0, 1000.0, 800.0, 600.0))
 STEP_M = 1.0
-GAP_M = 1000.0  # between parts
 # x to the right along the street, y down, z away from it
 LOOKING_LEFT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class Street:
-    """The points, and what the images see of them.
+    """Points and images of a street.
 
     Attributes
     ----------
-    xyz : float64 (N, 3), from one end of the street to the other.
+    xyz : float64 (N, 3), ordered along the street.
     poses : ``cam_from_world`` of each image.
-    first : int64 (I,); image i sees the points from first[i] on.
-    num_seen : how many points each image sees.
-    num_keypoints : of an image; ``num_seen`` of them see a point.
+    first : int64 (I,); image i sees the points first[i] to first[i] + num_seen - 1.
+    num_seen : number of points per image.
+    num_keypoints : number of keypoints per image; ``num_seen`` of them observe a point.
     """
 
     xyz: NDArray[np.float64]
@@ -46,16 +45,16 @@ class Street:
         return tuple(f"map/{i:06d}.jpg" for i in range(len(self.poses)))
 
     def seen(self, image: int) -> NDArray[np.int64]:
-        """The points (num_seen,) that an image sees."""
+        """Return the points (num_seen,) that an image sees."""
         return self.first[image] + np.arange(self.num_seen)
 
     def keypoints_of_seen(self, image: int) -> NDArray[np.int64]:
-        """The keypoint (num_seen,) of an image for each point it sees, in their order."""
+        """Return the keypoint (num_seen,) of each point that an image sees."""
         rng = np.random.default_rng([1, image])
         return rng.permutation(self.num_keypoints)[: self.num_seen]
 
     def observations(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Images, keypoints and points (O,), sorted by point."""
+        """Return images, keypoints and points (O,), sorted by point."""
         count = len(self.poses)
         images = np.repeat(np.arange(count), self.num_seen)
         keypoints = np.concatenate([self.keypoints_of_seen(i) for i in range(count)])
@@ -64,7 +63,7 @@ class Street:
         return images[order], keypoints[order], points[order]
 
     def keypoints_px(self, image: int) -> NDArray[np.float32]:
-        """Keypoints (num_keypoints, 2) of an image: of points where it sees some, else anywhere."""
+        """Return keypoints (num_keypoints, 2): projections of seen points, and random ones."""
         rng = np.random.default_rng([2, image])
         px = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (self.num_keypoints, 2))
         xyz = self.xyz[self.seen(image)]
@@ -72,15 +71,13 @@ class Street:
         return px.astype(np.float32)
 
     def index(self) -> MapIndex:
-        """The map's index, as reading it from files would make it."""
+        """Build the index of the map, equal to the index read from files."""
         images, keypoints, points = self.observations()
         return MapIndex.build(self.xyz, self.names, images, keypoints, points)
 
 
-def make_street(
-    num_images: int, num_points: int, num_seen: int, num_keypoints: int, num_parts: int = 1
-) -> Street:
-    """A street of that size, in parts a kilometre from each other; the same every time."""
+def make_street(num_images: int, num_points: int, num_seen: int, num_keypoints: int) -> Street:
+    """Build a street; deterministic."""
     rng = np.random.default_rng(0)
     length = num_images * STEP_M
     xyz = np.stack(
@@ -91,45 +88,35 @@ def make_street(
         ],
         axis=1,
     )
-    middles = (np.arange(num_images) + 0.5) * STEP_M
-    part, part_of_point = ((x * num_parts / length).astype(np.int64) for x in (middles, xyz[:, 0]))
-    bounds = np.searchsorted(part_of_point, np.arange(num_parts + 1))
-    xyz[:, 0] += part_of_point * GAP_M
-    places = middles + part * GAP_M
-    poses = tuple(looking_left(x, 0.0, 0.0, 0.0) for x in places.tolist())
-    nearest = np.round(middles * num_points / length - num_seen / 2)
-    first = np.clip(nearest, bounds[part], bounds[part + 1] - num_seen).astype(np.int64)
+    along_m = (np.arange(num_images) + 0.5) * STEP_M
+    poses = tuple(looking_left(x, 0.0, 0.0, 0.0) for x in along_m.tolist())
+    nearest = np.round(along_m * num_points / length - num_seen / 2)
+    first = np.clip(nearest, 0, num_points - num_seen).astype(np.int64)
     return Street(xyz, poses, first, num_seen, num_keypoints)
 
 
 def looking_left(x: float, y: float, z: float, angle_rad: float) -> RigidTransform:
-    """``cam_from_world`` at a place of the street, turned about the vertical."""
+    """Return ``cam_from_world`` at a position, rotated about the vertical."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
-    rotation = turn @ LOOKING_LEFT
+    yaw = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+    rotation = yaw @ LOOKING_LEFT
     return RigidTransform.from_matrix(rotation, -rotation @ np.array([x, y, z]))
 
 
 def random_pose(street: Street, rng: np.random.Generator, margin: int) -> RigidTransform:
-    """A query's pose, at least ``margin`` images from the street's ends."""
+    """Draw a query pose at least ``margin`` images from the ends of the street."""
     x = rng.uniform(margin, len(street.poses) - margin) * STEP_M
     return looking_left(x, rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3))
 
 
-def pose_near(street: Street, rng: np.random.Generator, image: int) -> RigidTransform:
-    """A query's pose within half a step of an image."""
-    x = street.poses[image].center()[0] + rng.uniform(-0.5, 0.5) * STEP_M
-    return looking_left(x, rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3))
-
-
-def nearest_images(street: Street, place: float, count: int) -> NDArray[np.int64]:
-    """The ``count`` images nearest to a place along the street, in metres; nearest first."""
-    places = (np.arange(len(street.poses)) + 0.5) * STEP_M
-    return np.argsort(np.abs(places - place), kind="stable")[:count]
+def nearest_images(street: Street, x: float, count: int) -> NDArray[np.int64]:
+    """Return the ``count`` images nearest to ``x`` metres along the street, nearest first."""
+    along_m = (np.arange(len(street.poses)) + 0.5) * STEP_M
+    return np.argsort(np.abs(along_m - x), kind="stable")[:count]
 
 
 def in_view(pose: RigidTransform, xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (N, 3) a query sees."""
+    """Test which points (N, 3) project into the image."""
     px = project(CAMERA, pose, xyz)
     inside = (px > 0) & (px < (CAMERA.width, CAMERA.height))
     return np.asarray(inside.all(axis=1))

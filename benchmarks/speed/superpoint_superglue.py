@@ -1,12 +1,12 @@
-"""SuperPoint and SuperGlue beside transformers' implementations, on the same random weights.
+"""Compare SuperPoint and SuperGlue with transformers' implementations on random weights.
 
     .venv/bin/python benchmarks/speed/superpoint_superglue.py
     .venv/bin/python benchmarks/speed/superpoint_superglue.py --device cuda
 
-On a processor: seconds of both, in turns in one process, and whether their results agree; peak
-memory of a pair. On a GPU: scores there against those of the processor on weights whose attention
-is peaky, in float32 and in half precision, and images and pairs per second. Random weights cost
-what trained ones do, except that they find more candidates for keypoints.
+On a CPU: seconds of both, run alternately in one process, agreement of their results, and peak
+memory of a pair. On a GPU: agreement with the CPU in float32 and half precision, with weights that
+give peaked attention, and images and pairs per second. Random weights take as long as trained ones,
+except for a larger number of keypoint candidates.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ Weights = dict[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class Seconds:
-    """Medians of one function. ``cpu`` (all threads) tells a busy machine from slow code."""
+    """Median times of a function. ``cpu`` (all threads) is unaffected by other load."""
 
     wall: float
     cpu: float
 
 
-def in_turns(functions: dict[str, Callable[[], Any]], repeat: int) -> dict[str, Seconds]:
-    """Medians of each, one after the other ``repeat`` times; once before to warm up."""
+def time_alternately(functions: dict[str, Callable[[], Any]], repeat: int) -> dict[str, Seconds]:
+    """Call the functions in turn, once to warm up and ``repeat`` times; return the medians."""
     wall: dict[str, list[float]] = {name: [] for name in functions}
     cpu: dict[str, list[float]] = {name: [] for name in functions}
     for turn in range(repeat + 1):
@@ -75,12 +75,12 @@ def superpoint_weights() -> Weights:
     net = SuperPointNet()
     for name, value in net.named_parameters():
         if name.endswith("weight"):
-            torch.nn.init.kaiming_normal_(value)  # activations keep their size with the depth
+            torch.nn.init.kaiming_normal_(value)  # keeps the magnitude of activations
     return net.state_dict()
 
 
 def superglue_weights() -> Weights:
-    """Attention that looks at few keypoints, and descriptors that correspond are found."""
+    """Return weights with peaked attention that match corresponding descriptors."""
     torch.manual_seed(0)
     weights = SuperGlueNet().state_dict()
     for key, value in weights.items():
@@ -95,14 +95,14 @@ def superglue_weights() -> Weights:
 
 
 def random_pair(num: int, seed: int = 0) -> tuple[ImageFeatures, ImageFeatures]:
-    """Three quarters of the keypoints are seen twice."""
+    """Return features of two images that share three quarters of their keypoints."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0, [WIDTH, HEIGHT], (2, num, 2))
     descriptors = rng.standard_normal((2, num, 256))
     scores = rng.uniform(0.01, 0.9, (2, num))
-    both = num * 3 // 4
-    xy[1, :both] = np.clip(xy[0, :both] + 20 * rng.standard_normal((both, 2)), 0, HEIGHT)
-    descriptors[1, :both] = descriptors[0, :both] + 0.7 * rng.standard_normal((both, 256))
+    shared = num * 3 // 4
+    xy[1, :shared] = np.clip(xy[0, :shared] + 20 * rng.standard_normal((shared, 2)), 0, HEIGHT)
+    descriptors[1, :shared] = descriptors[0, :shared] + 0.7 * rng.standard_normal((shared, 256))
     descriptors /= np.linalg.norm(descriptors, axis=2, keepdims=True)
     a, b = (
         ImageFeatures(
@@ -117,7 +117,7 @@ def random_pair(num: int, seed: int = 0) -> tuple[ImageFeatures, ImageFeatures]:
 
 
 def random_image() -> torch.Tensor:
-    """Gray noise with structure at several scales, (1, 1, HEIGHT, WIDTH)."""
+    """Return gray noise at several scales, (1, 1, HEIGHT, WIDTH)."""
     generator = torch.Generator().manual_seed(0)
     image = torch.zeros(1, 1, HEIGHT, WIDTH)
     for side in (4, 16, 64):
@@ -129,11 +129,11 @@ def random_image() -> torch.Tensor:
 def their_superpoint(weights: Weights, num: int) -> Any:
     from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
-    # without borders: transformers puts the right and the lower one outside the image
+    # no border removal: transformers misplaces the right and the lower border
     config = SuperPointConfig(max_keypoints=num, border_removal_distance=0)
     model: Any = SuperPointForKeypointDetection(config)
     model.eval()
-    # both list the same layers in the same order
+    # both have the same layers in the same order
     model.load_state_dict(dict(zip(model.state_dict(), weights.values(), strict=True)))
     return model
 
@@ -156,13 +156,13 @@ def superpoint_rows(num: int, repeat: int) -> list[tuple[str, ...]]:
     def keypoints(
         dense: tuple[torch.Tensor, torch.Tensor],
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        found = select_pixels(
+        pixels = select_pixels(
             suppress_non_maxima(dense[0][0], 4), threshold=0.005, max_keypoints=num
         )
-        return found.xy, found.scores, sample_descriptors(dense[1][0], found.xy, "official")
+        return pixels.xy, pixels.scores, sample_descriptors(dense[1][0], pixels.xy, "official")
 
     with inference(CPU):
-        seconds = in_turns(
+        seconds = time_alternately(
             {
                 "theirs dense": their_dense,
                 "ours dense": lambda: ours(gray),
@@ -177,14 +177,14 @@ def superpoint_rows(num: int, repeat: int) -> list[tuple[str, ...]]:
         expected = theirs(gray.expand(1, 3, -1, -1))
     their_xy = (expected.keypoints[0] * torch.tensor([WIDTH, HEIGHT])).round().long()
     same = _jaccard(xy.tolist(), their_xy.tolist())
-    ranked = (xy == their_xy).all(dim=1)  # others have scores that differ by the last bits
+    ranked = (xy == their_xy).all(dim=1)  # the order differs where scores differ in the last bits
     worst = (descriptors - expected.descriptors[0])[ranked].abs().max()
     dense_text = f"scores differ by {dense[0]:.0e}, descriptors by {dense[1]:.0e}"
-    found_text = f"{len(xy)} keypoints, Jaccard {same:.4f}, descriptors differ by {worst:.0e}"
+    sparse_text = f"{len(xy)} keypoints, Jaccard {same:.4f}, descriptors differ by {worst:.0e}"
     compared = (
         ("dense", "theirs dense", "ours dense", dense_text),
-        ("post-processing ours in both", "theirs with our post-processing", "ours", ""),
-        ("each with its own", "theirs", "ours", found_text),
+        ("our post-processing in both", "theirs with our post-processing", "ours", ""),
+        ("complete", "theirs", "ours", sparse_text),
     )
     return [
         _row(f"SuperPoint, {label}", seconds[a], seconds[b], text) for label, a, b, text in compared
@@ -207,7 +207,7 @@ def _row(label: str, theirs: Seconds, ours: Seconds, text: str) -> tuple[str, ..
 def their_superglue(weights: Weights) -> Any:
     from transformers import SuperGlueConfig, SuperGlueForKeypointMatching
 
-    by_head = torch.arange(256).view(64, 4).T.flatten()  # theirs are one after the other
+    by_head = torch.arange(256).view(64, 4).T.flatten()  # their channels are grouped by head
     names = {
         "attn.proj.0": "attention.self.query",
         "attn.proj.1": "attention.self.key",
@@ -238,9 +238,9 @@ def their_superglue(weights: Weights) -> Any:
         config(matching_threshold=THRESHOLD, attn_implementation="eager")
     )
     model.eval()
-    refused = model.load_state_dict(renamed, strict=False)
-    assert not refused.unexpected_keys
-    assert all(key.startswith("keypoint_detector.") for key in refused.missing_keys)
+    keys = model.load_state_dict(renamed, strict=False)
+    assert not keys.unexpected_keys
+    assert all(key.startswith("keypoint_detector.") for key in keys.missing_keys)
     return model
 
 
@@ -252,9 +252,9 @@ def superglue_row(num: int, repeat: int) -> tuple[str, ...]:
     pair = random_pair(num)
     tables = torch.stack([torch.from_numpy(side.keypoints_px) for side in pair])
     described = torch.stack([torch.from_numpy(side.descriptors) for side in pair])
-    half = torch.tensor([WIDTH, HEIGHT]) / 2
-    places = (tables[:, :, :2] - half) / (0.7 * WIDTH)
-    a, b = (ImageKeypoints(places[k], tables[k, :, 2], described[k]) for k in (0, 1))
+    center = torch.tensor([WIDTH, HEIGHT]) / 2
+    normalized = (tables[:, :, :2] - center) / (0.7 * WIDTH)
+    a, b = (ImageKeypoints(normalized[k], tables[k, :, 2], described[k]) for k in (0, 1))
 
     def match() -> tuple[torch.Tensor, torch.Tensor]:
         return mutual_matches(ours([(a, b)], 100)[0], THRESHOLD)
@@ -265,7 +265,7 @@ def superglue_row(num: int, repeat: int) -> tuple[str, ...]:
         )
 
     with inference(CPU):
-        seconds = in_turns({"theirs": their_match, "ours": match}, repeat)
+        seconds = time_alternately({"theirs": their_match, "ours": match}, repeat)
         matches, scores = match()
         partner, their_scores, _, _ = their_match()
     rows = torch.nonzero(partner[0, 0] >= 0)[:, 0]
@@ -282,7 +282,7 @@ def _jaccard(a: list[list[int]], b: list[list[int]]) -> float:
 
 
 def peak_memory_mb(num: int, threads: int) -> tuple[float, float]:
-    """Of a process of its own that matches one pair: before it, and the most it ever had."""
+    """Return the memory of a separate process before matching a pair, and its peak."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(_match_once, (num, threads))
 
@@ -314,7 +314,7 @@ def _plugins(folder: Path, device: Device, *, half: bool) -> tuple[SuperPoint, S
 
 
 def on_gpu(gpu: Device, num: int, repeat: int) -> None:
-    """Results of the GPU against the processor's, and both machines' speed, through the plugins."""
+    """Compare results and speed of the plugins on the GPU and the CPU."""
     noise = (random_image()[0, 0].numpy() * 255).astype(np.uint8)
     image = np.ascontiguousarray(np.repeat(noise[:, :, None], 3, axis=2))
     a, b = random_pair(num)
@@ -326,14 +326,14 @@ def on_gpu(gpu: Device, num: int, repeat: int) -> None:
         matches, scores = glue.match(a, b)
         confidence = dict(zip(map(tuple, matches.tolist()), scores.tolist(), strict=True))
         kinds: tuple[tuple[str, Device, bool], ...] = (
-            ("processor", "cpu", False),
+            ("CPU", "cpu", False),
             ("GPU", gpu, False),
             ("GPU, half precision", gpu, True),
         )
         for label, device, half in kinds:
             points, glue = _plugins(Path(folder), device, half=half)
             many = others if device == gpu else others[:1]
-            seconds = in_turns(
+            seconds = time_alternately(
                 {
                     "image": partial(points.extract, image),
                     "pairs": partial(glue.match_many, a, many),
@@ -341,10 +341,10 @@ def on_gpu(gpu: Device, num: int, repeat: int) -> None:
                 repeat,
             )
             same_xy = _jaccard(points.extract(image).keypoints_px[:, :2].tolist(), xy)
-            found, values = glue.match(a, b)
-            pairs = zip(map(tuple, found.tolist()), values.tolist(), strict=True)
+            gpu_matches, values = glue.match(a, b)
+            pairs = zip(map(tuple, gpu_matches.tolist()), values.tolist(), strict=True)
             differ = [abs(value - confidence[key]) for key, value in pairs if key in confidence]
-            same = _jaccard(found.tolist(), matches.tolist())
+            same = _jaccard(gpu_matches.tolist(), matches.tolist())
             rows.append(
                 (
                     label,
@@ -355,9 +355,7 @@ def on_gpu(gpu: Device, num: int, repeat: int) -> None:
                     f"{max(differ):.0e}",
                 )
             )
-    print(
-        f"{WIDTH}x{HEIGHT}, {num} keypoints; keypoints and matches: Jaccard index to the processor"
-    )
+    print(f"{WIDTH}x{HEIGHT}, {num} keypoints; keypoints and matches: Jaccard index to the CPU")
     print(table(rows))
     print(f"peak memory on the GPU {torch.cuda.max_memory_allocated(gpu) / 2**20:.0f} MB")
 
@@ -375,16 +373,16 @@ def main() -> None:
         on_gpu(options.device, options.keypoints, options.repeat)
         return
     load = os.getloadavg()[0]
-    # first: a new process starts from what this one has
+    # first, because a new process inherits the memory of this one
     before, peak = peak_memory_mb(options.keypoints, options.threads)
     rows: list[tuple[str, ...]] = [
         ("seconds", "transformers", "ours", "ratio", "cpu", "ours", "ratio", "agreement")
     ]
     rows += superpoint_rows(options.keypoints, options.repeat)
     rows.append(superglue_row(options.keypoints, options.repeat))
-    print(f"{WIDTH}x{HEIGHT}, {options.threads} threads, {options.repeat} turns")
+    print(f"{WIDTH}x{HEIGHT}, {options.threads} threads, {options.repeat} repetitions")
     print(table(rows))
-    print(f"peak memory of a SuperGlue pair {peak:.0f} MB, of these {before:.0f} before the pair")
+    print(f"peak memory of a SuperGlue pair {peak:.0f} MB, {before:.0f} MB before the pair")
     print(f"load average {load:.1f} before, {os.getloadavg()[0]:.1f} after")
 
 

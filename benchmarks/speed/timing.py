@@ -1,4 +1,4 @@
-"""Wall-clock and processor time of commands, and tables of both."""
+"""Wall-clock and CPU time of commands, and text tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Timed:
-    """One step. ``cpu_s`` (user and system, all processes) tells a busy machine from slow code."""
+    """Times of a step. ``cpu_s`` (user and system, all processes) is unaffected by other load."""
 
     name: str
     wall_s: float
@@ -23,7 +23,7 @@ class Timed:
 def timed_command(
     name: str, command: Sequence[str], environment: Mapping[str, str], log: Path
 ) -> Timed:
-    """Run a command, its output in ``log``; exits with the log's end when the command fails."""
+    """Run a command with its output in ``log``; on failure exit with the end of the log."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     with log.open("wb") as stream:
@@ -37,16 +37,8 @@ def timed_command(
     return Timed(name, wall_s, cpu_s)
 
 
-def peak_gib(*, reset: bool = False) -> float:
-    """Most memory since it was reset (Linux)."""
-    if reset:
-        Path("/proc/self/clear_refs").write_text("5")
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmHWM:")[2].split()[0]) / (1 << 20)
-
-
 def table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of text as aligned columns, the first to the left and the others to the right."""
+    """Align rows of text in columns, the first to the left and the others to the right."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = []
     for row in rows:

@@ -1,9 +1,9 @@
-"""Uncertainty of a large map's points: seconds; and the difference from Ceres on a small one.
+"""Time the uncertainties of a large map's points, and compare a small map with Ceres.
 
     .venv/bin/python benchmarks/speed/uncertainty.py
 
-The large map is made of random numbers: images around points that each is seen by ten of them.
-Eigenvalues (the deviations along three axes) are part of the time.
+The large map is random, with ten observations per point. The time includes the eigenvalues
+(standard deviations along three axes).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CAMERAS = {
 
 
 def random_map(num_points: int, num_images: int, camera: Camera) -> tuple[Any, ...]:
-    """Points before images that look the same way: the arguments of point_covariances."""
+    """Return random arguments of point_covariances; all images have the same orientation."""
     rng = np.random.default_rng(0)
     xyz = rng.uniform((-5, -5, 8), (5, 5, 15), (num_points, 3))
     poses = [
@@ -46,14 +46,14 @@ def random_map(num_points: int, num_images: int, camera: Camera) -> tuple[Any, .
 
 
 def seconds(arguments: tuple[Any, ...]) -> tuple[float, float]:
-    """Of one computation, eigenvalues included: by the clock, and of the processors together."""
+    """Return the wall-clock and CPU seconds of a computation with eigenvalues."""
     start, cpu = time.perf_counter(), time.process_time()
     point_deviations(point_covariances(*arguments))
     return time.perf_counter() - start, time.process_time() - cpu
 
 
 def ceres_difference(model: str) -> tuple[int, float, float, float]:
-    """Points, Ceres' seconds, ours, and the largest relative difference of a covariance."""
+    """Return the observations, the seconds of both and the largest relative difference."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 2
@@ -93,12 +93,12 @@ def ceres_difference(model: str) -> tuple[int, float, float, float]:
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(
         pycolmap.BundleAdjustmentOptions(), config, scene
     )
-    wanted = pycolmap.BACovarianceOptions()
-    wanted.params = pycolmap.BACovarianceOptionsParams.POINTS
-    wanted.damping = 0.0
-    found: Any = pycolmap.estimate_ba_covariance(wanted, scene, adjuster)
+    covariance_options = pycolmap.BACovarianceOptions()
+    covariance_options.params = pycolmap.BACovarianceOptionsParams.POINTS
+    covariance_options.damping = 0.0
+    result: Any = pycolmap.estimate_ba_covariance(covariance_options, scene, adjuster)
     theirs_s = time.perf_counter() - start
-    theirs: NDArray[np.float64] = np.array([found.get_point_cov(point_id) for point_id in ids])
+    theirs: NDArray[np.float64] = np.array([result.get_point_cov(point_id) for point_id in ids])
     ours_s, _ = seconds(arguments)
     ours = point_covariances(*arguments)
     upper = theirs[:, *np.triu_indices(3)]
@@ -117,7 +117,7 @@ def main() -> int:
         f"{len(os.sched_getaffinity(0))} threads; covariances and eigenvalues"
     )
     rows: list[tuple[str, ...]] = [
-        ("cameras", "first call, s", f"best of {options.repeat} more, s", "its processors, s")
+        ("cameras", "first call, s", f"best of {options.repeat} more, s", "CPU s")
     ]
     for model, camera in CAMERAS.items():
         arguments = random_map(options.points, options.images, camera)
@@ -125,7 +125,7 @@ def main() -> int:
         best, cpu = min(seconds(arguments) for _ in range(options.repeat))
         rows.append((model, f"{first:.2f}", f"{best:.2f}", f"{cpu:.2f}"))
     print(table(rows))
-    print("(a first call compiles, once per machine)\n\nagainst Ceres, poses and cameras fixed")
+    print("(the first call compiles)\n\ncompared with Ceres, poses and cameras fixed")
     rows = [("cameras", "observations", "Ceres, s", "ours, s", "relative difference")]
     worst = 0.0
     for model in CAMERAS:
