@@ -71,7 +71,7 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
         message = (
             f"the given poses contradict the matches: {counts[0]} of {total} matches in "
             f"{len(pairs)} image pairs fit them; with {' or '.join(better)}, {counts[1:].max()} "
-            "would. Convert the poses to cam_from_world with x right, y down, z forward"
+            "would fit. Convert the poses to cam_from_world with x right, y down, z forward"
         )
         return message, True
     wrong, right = _split(pairs)
