@@ -33,7 +33,7 @@ def compiled_loop(function: Callable[..., Any]) -> Any:
 
 
 def _called_elsewhere(function: Callable[..., Any]) -> str:
-    """Return a digest of imported loops of other files; empty if there are none."""
+    """Return a digest of loops imported from other files, or an empty text without any."""
     others = [
         value.py_func
         for value in function.__globals__.values()

@@ -21,8 +21,7 @@ from megloc_kapture.cli.common import (
 )
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
-from megloc_kapture.datasets.megadepth import import_megadepth
-from megloc_kapture.errors import check_option
+from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.datasets import (
@@ -36,7 +35,7 @@ from megloc_kapture.pipeline.datasets import (
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.export import ExportFormat, export
 from megloc_kapture.pipeline.map_making import import_colmap
-from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.pipeline.presets import assigned, options_with
 from megloc_kapture.stages.query_poses import set_aside_unreadable
 from megloc_kapture.stages.stage import MAP
 from megloc_kapture.stages.work import Work
@@ -120,13 +119,10 @@ class Import(Common):
             console.say("unit: unknown scale; use --unit m if the map is in metres")
 
     def _import_megadepth(self, console: Console) -> None:
-        chosen = assigned(self.set)
-        scenes = chosen.pop("scenes", ())
-        check_option(not chosen, f"megadepth has one option, scenes; got {', '.join(chosen)}")
-        names = [str(name) for name in (scenes if isinstance(scenes, list | tuple) else [scenes])]
+        options = options_with(MegaDepthOptions, self.set)
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
             work = Work(track=console.track)
-            counts = import_megadepth(self.root, out, names, work=work)
+            counts = import_megadepth(self.root, out, options.scenes, work=work)
         console.counts(counts)
 
 

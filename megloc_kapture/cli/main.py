@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 from megloc_kapture.errors import MeglocError, OptionError, missing_extra, suggestion
 
@@ -104,9 +104,8 @@ def _parser(given: Sequence[str]) -> Any:
     return functools.reduce(operator.or_, commands)
 
 
-def _stop(how: str, status: int) -> NoReturn:
+def _say_stopped(how: str) -> None:
     print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
-    sys.exit(status)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -118,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     debug = False
     try:
         if arguments is None:
-            signal.signal(signal.SIGTERM, lambda *_: _stop("terminated", TERMINATED))
+            signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
         if list(given) == ["--version"]:
             from megloc_kapture import __version__
 
@@ -133,7 +132,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         status = command.run(command.console()) or DONE
         sys.stdout.flush()
     except KeyboardInterrupt:
-        _stop("interrupted", INTERRUPTED)
+        _say_stopped("interrupted")
+        status = INTERRUPTED
+    except SystemExit as end:
+        # printed here, not by the signal handler, which may have interrupted another print
+        if end.code == TERMINATED:
+            _say_stopped("terminated")
+        raise
     except Exception as error:
         status = _tell(error, debug)
     sys.exit(status)

@@ -16,9 +16,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import read_colmap_model
@@ -27,13 +29,26 @@ from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 _DEPTHS = ("phoenix/S6/zl548/MegaDepth_v1/{}/dense0/depths", "depth_undistorted/{}")
 _UNDISTORTED, _SCENE_INFO = "Undistorted_SfM", "scene_info"
 _MODELS = ("sparse", "sparse-txt", "sparse/0")
 _ARRAYS = ("image_paths", "intrinsics", "poses")
 _IDENTITY = RigidTransform.identity()
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    return tuple(map(str, value if isinstance(value, list | tuple) else (value,)))
+
+
+class MegaDepthOptions(Options):
+    """Options of importing MegaDepth."""
+
+    # 5001 is a number to the command line
+    scenes: Annotated[tuple[str, ...], BeforeValidator(_texts)] = Field(
+        default=(), description="scene numbers; none: all"
+    )
 
 
 @dataclass(frozen=True)

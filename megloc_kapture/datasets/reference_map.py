@@ -131,10 +131,15 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
 _MAX_SHIFT_PX = 1.0
 
 
-WITHOUT_DATABASE = (
-    "The reference model comes without descriptors: its database is missing. "
-    "`megloc localize` extracts them again from the images."
-)
+def published_database(path: Path | None, remarks: list[str]) -> Path | None:
+    """Return the feature database of a published model; if it is missing, None and a remark."""
+    if path is not None and path.is_file():
+        return path
+    remarks.append(
+        "The reference model comes without descriptors: its database is missing. "
+        "`megloc localize` extracts them again from the images."
+    )
+    return None
 
 
 def check_model_files(files: Iterable[Path]) -> None:

@@ -130,8 +130,9 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
         both = f"{first.label} and {other.label} have different"
         check_option(first.thresholds == other.thresholds, f"{both} thresholds")
         check_option(first.errors.names == other.errors.names, f"{both} queries")
-        conditions = ([q.condition for q in e.queries] for e in (first, other))
-        check_option(next(conditions) == next(conditions), f"{both} conditions")
+        ours = [query.condition for query in first.queries]
+        theirs = [query.condition for query in other.queries]
+        check_option(ours == theirs, f"{both} conditions")
 
 
 def mcnemar(only_first: int, only_second: int) -> float:

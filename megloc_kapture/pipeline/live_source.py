@@ -559,15 +559,15 @@ class LiveSource:
         self._matching, self._cam_from_rig = matching, cam_from_rig
         self._features = matching.features(image)
         self.clock.lap("extraction")
-        self._ranked, ranked = matching.candidates(image, self._features)
-        self.candidates = self._ranked
+        self._images, ranked = matching.candidates(image, self._features)
+        self.candidates = self._images
         self.clock.lap("retrieval")
         self._matches: list[list[VerifiedMatches]] = [[] for _ in matching.types]
         options = matching.options
         self._needs_all = options.reranking.reranks() or options.matches_again()
         self.in_turn = ranked and not self._needs_all
         if self._needs_all:
-            self._view = self._match(len(self._ranked))
+            self._view = self._match(len(self._images))
 
     def view(self, count: int) -> QueryView:
         view = self._view if self._needs_all else self._match(count)
@@ -576,7 +576,7 @@ class LiveSource:
     def _match(self, count: int) -> QueryView:
         """Match those of the first ``count`` ranked images that are not matched yet."""
         self.clock.start()
-        images, types = self._ranked[:count], self._matching.types
+        images, types = self._images[:count], self._matching.types
         num_matched = min(map(len, self._matches), default=0)
         new = self._matching.match(self._features, images[num_matched:])
         for matches, added in zip(self._matches, new, strict=True):

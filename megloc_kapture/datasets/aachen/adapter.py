@@ -25,7 +25,7 @@ from megloc_kapture.datasets.official import (
     last_part,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import WITHOUT_DATABASE, check_model_files
+from megloc_kapture.datasets.reference_map import check_model_files, published_database
 from megloc_kapture.errors import OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
@@ -289,7 +289,7 @@ class Aachen:
             return self._dataset(images, missing, remarks, image_files=files)
         layout = Layout(root)
         images, left_out = layout.read(layout.version(self.options.version), missing)
-        remarks, model = [], dict[str, Any]()
+        remarks, reference, database = [], None, None
         if images.version == "1.0" and not layout.database_intrinsics.is_file():
             remarks.append(
                 f"Without {layout.database_intrinsics.name} the map images' principal points are "
@@ -300,17 +300,16 @@ class Aachen:
                 f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
             )
         if self.options.reference_model:
-            model["reference"] = partial(layout.read_points, images.version)
-            if images.version == "1.0" and layout.feature_database.is_file():
-                model["reference_database"] = layout.feature_database
-            else:
-                remarks.append(WITHOUT_DATABASE)
+            reference = partial(layout.read_points, images.version)
+            published = layout.feature_database if images.version == "1.0" else None
+            database = published_database(published, remarks)
         return self._dataset(
             images,
             missing,
             remarks,
             links={"": layout.images},
-            **model,
+            reference=reference,
+            reference_database=database,
         )
 
     def _dataset(

@@ -246,10 +246,10 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
     files: dict[str, RelocalizationFile] = {}
     for folder in _RELOCALIZATION_FOLDERS:
         for path in sorted(root.glob(f"{folder}/reloc*.txt")):
-            named = parse_relocalization_name(path.name)
-            if named is None or not path.is_file():
+            parsed = parse_relocalization_name(path.name)
+            if parsed is None or not path.is_file():
                 continue
-            source, target = named
+            source, target = parsed
             owner = path.relative_to(root).parts[0]
             if source is None and owner in known:
                 source = owner

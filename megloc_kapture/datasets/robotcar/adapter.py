@@ -18,7 +18,7 @@ from megloc_kapture.datasets.official import (
     OfficialDataset,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import WITHOUT_DATABASE, check_model_files
+from megloc_kapture.datasets.reference_map import check_model_files, published_database
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
@@ -145,13 +145,11 @@ class RobotCar:
         cameras = {camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))}
         find = image_finder(layout, missing)
         selection = select(version, reference, queries, cameras=cameras, find=find, **chosen)
-        model, remarks = dict[str, Any](), list[str]()
+        remarks: list[str] = []
+        model, database = None, None
         if self.options.reference_model:
-            model["reference"] = partial(_read_points, layout, selection)
-            if layout.feature_database.is_file():
-                model["reference_database"] = layout.feature_database
-            else:
-                remarks.append(WITHOUT_DATABASE)
+            model = partial(_read_points, layout, selection)
+            database = published_database(layout.feature_database, remarks)
         return self._dataset(
             selection,
             read_car(layout, selection, missing),
@@ -159,7 +157,8 @@ class RobotCar:
             remarks,
             reference_images=layout.num_reference_images(),
             links={"": layout.images},
-            **model,
+            reference=model,
+            reference_database=database,
         )
 
     def _read_kapture(
