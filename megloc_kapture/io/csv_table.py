@@ -104,6 +104,7 @@ OrNone = BeforeValidator(lambda text: text or None)
 OrNan = Annotated[float, BeforeValidator(lambda text: text or "nan")]
 
 
+@lru_cache
 def columns_of(record: Callable[..., Any]) -> tuple[str, ...]:
     return tuple(inspect.signature(record).parameters)
 

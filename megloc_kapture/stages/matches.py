@@ -19,7 +19,13 @@ from pydantic import Field
 
 from megloc_kapture.errors import PluginError, require
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
+from megloc_kapture.io.kapture import (
+    FeatureReader,
+    ImagePair,
+    KaptureFolder,
+    MatchesWriter,
+    read_pairs,
+)
 from megloc_kapture.io.tables import (
     PairCount,
     append_match_count,
@@ -367,10 +373,17 @@ def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
     return _features(spec.key, local_type, image)
 
 
+@lru_cache(maxsize=8)
+def _readers(
+    key: tuple[Any, ...], local_type: str
+) -> tuple[KaptureFolder, FeatureReader, FeatureReader]:
+    folder = open_folder(*key)
+    return folder, folder.keypoints(local_type), folder.descriptors(local_type)
+
+
 @lru_cache(maxsize=CACHED_IMAGES)
 def _features(key: tuple[Any, ...], local_type: str, image: str) -> Features:
-    folder = open_folder(*key)
-    keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
+    folder, keypoints, descriptors = _readers(key, local_type)
     check_lengths(keypoints, descriptors, image)
     camera = folder.read().camera_of(image)
     return Features.of(camera, keypoints.read(image), descriptors.read(image))
