@@ -58,7 +58,7 @@ def load_plugin(
     except ValidationError as error:
         fault = option_fault(error, model)
         raise PluginError(f"plugin {name!r} refuses its options: {fault}") from error
-    except Exception as error:  # any error of a foreign constructor
+    except Exception as error:  # a third-party constructor may raise anything
         reason = " ".join(str(error).split())
         raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
 
@@ -107,7 +107,7 @@ def plugin_class(group: str, name: str) -> Any:
         raise PluginError(f"plugin {name!r} of {group} is registered twice: {sorted(origins)}")
     try:
         kind = entries[0].load()
-    except Exception as error:  # any error of a foreign module's import
+    except Exception as error:  # importing a third-party module may raise anything
         reason = missing_extra(error) or error
         raise PluginError(
             f"plugin {name!r} ({entries[0].value}) cannot be loaded: {reason}"
@@ -126,7 +126,7 @@ def plugin_class(group: str, name: str) -> Any:
 def code_of(kind: type) -> str:
     """Return package version and code hash of a class.
 
-    The hash covers its module, for foreign classes all modules of their package.
+    The hash covers the module of the class; for a third-party class, all modules of its package.
     """
     module = sys.modules.get(kind.__module__)
     source = getattr(module, "__file__", None)
@@ -148,7 +148,7 @@ def is_ours(kind: type) -> bool:
 
 
 def has_precision(plugin: object) -> bool:
-    """Return whether a plugin, or one that it uses, runs a network."""
+    """Return whether a plugin has the option ``half_precision``, as those that run networks do."""
     return hasattr(getattr(plugin, "options", None), "half_precision")
 
 

@@ -1,7 +1,7 @@
 """Pose errors, recall at thresholds with its confidence intervals, medians, and confidences.
 
-A pose is correct if it is within the coarsest threshold; for a query that does not show the map,
-every pose is wrong.
+To judge confidences, a pose is correct if it is within the coarsest threshold; every pose of a
+query that shows nothing of the map is wrong.
 
 Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015
 (calibration error); Geifman and El-Yaniv, "Selective classification for deep neural networks",
@@ -68,10 +68,11 @@ def thresholds_from_pairs(pairs: Iterable[tuple[float, float | None]]) -> tuple[
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseErrors:
-    """Distances of camera centres (N,) and rotation angles (N,) of the queries ``names``.
+    """Errors of the N queries ``names``.
 
-    Both errors of a query without a pose are infinite: it is beyond every threshold and raises
-    the median.
+    ``position_m`` (N,) are distances between estimated and true camera centres, ``angle_deg`` (N,)
+    angles between estimated and true rotations. Both errors of a query without a pose are infinite:
+    it is beyond every threshold and raises the median.
     """
 
     names: tuple[str, ...]
@@ -88,7 +89,7 @@ def pose_errors(
     truth: Mapping[str, RigidTransform],
     names: Iterable[str] | None = None,
 ) -> PoseErrors:
-    """Return the errors of ``names``, by default all images of ``truth``, sorted.
+    """Return the errors of ``names`` in their order; by default all images of ``truth``, sorted.
 
     Poses are ``cam_from_world`` in one frame, in metres.
     """
@@ -96,8 +97,8 @@ def pose_errors(
     position_m, angle_deg = np.full((2, len(listed)), np.inf)
     posed = [i for i, name in enumerate(listed) if name in estimated]
     if posed:
-        # compared as world_from_cam, step by step as kapture does: figures then agree to the last
-        # bit, and so do the queries that lie exactly on a threshold
+        # compare world_from_cam with kapture's sequence of operations: errors then equal kapture's
+        # to the last bit, and a query exactly on a threshold counts alike
         quats, centers = invert(*stack_poses(estimated[listed[i]] for i in posed))
         true_quats, true_centers = invert(*stack_poses(truth[listed[i]] for i in posed))
         position_m[posed] = np.linalg.norm(centers - true_centers, axis=1)
@@ -111,11 +112,11 @@ LEVEL = 0.95
 def confidence_interval(
     successes: ArrayLike, trials: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the exact (Clopper-Pearson) interval of a share; 0 to 1 without trials.
+    """Return the exact (Clopper-Pearson) interval of a proportion; 0 to 1 without trials.
 
-    It contains the true share with at least 95 % probability. Wilson's interval is narrower
-    but covers 91 % instead of 95 % near a recall of 99 % of 98 queries. Queries count as
-    independent draws, although those of one drive are not quite independent.
+    It contains the true proportion with at least 95 % probability. Wilson's interval is narrower,
+    but covers less near a recall of 1: 91 % for 98 queries and a true recall of 99.5 %. Queries
+    count as independent draws, although those of one drive are not quite independent.
     """
     from scipy.special import betaincinv
 
@@ -148,8 +149,9 @@ class RecallAt:
 class RecallRow:
     """Recall and medians of one condition, pool or ``"all"``.
 
-    Fallback poses are guesses: they count in recall, but not as localized. Medians are over all
-    queries, a missing pose counting as infinite, and over the localized queries.
+    Fallback poses are guesses: they count in recall, but not as localized. ``median_position_m``
+    and ``median_angle_deg`` are over all queries, with infinite errors where the pose is missing;
+    ``median_localized_*`` are over the localized queries only.
     """
 
     name: str
@@ -229,7 +231,8 @@ def row_members(conditions: Sequence[str], protocol: Protocol) -> dict[str, NDAr
     rows.append((ALL, np.ones(len(of_query), bool)))
     for name, number in Counter(name for name, _ in rows).items():
         check_option(
-            number <= 1, f"two rows of the recall table would be called {name!r}; rename one"
+            number <= 1,
+            f"two rows of the recall table would be called {name!r}; rename one of the conditions",
         )
     return dict(rows)
 
@@ -264,8 +267,9 @@ class Confidence:
     ----------
     num_poses, num_wrong : poses with a confidence, and those beyond the coarsest threshold.
     wrong_low, wrong_high : 95 % interval of the share of wrong poses.
-    num_nowhere_refused : of the queries that show nothing of the map, those without a pose.
-    calibration_error : mean difference between confidence and share of correct poses, over bins.
+    num_nowhere_refused : of the queries that show nothing of the map, those not localized (without
+        a pose, or with a fallback pose).
+    calibration_error : see :func:`calibration_error`.
     coverage, risk : (num_poses,) share of queries that are accepted, most confident first, and
         share of wrong poses among them.
     area, least_area, area_by_inliers : area under the risk curve; its minimum, with all correct
@@ -326,7 +330,7 @@ def confidence_of(
 
 
 def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[Bin, ...]:
-    """Count correct poses (N,) in ten bins of equal width over their confidences (N,)."""
+    """Sort poses by confidence (N,) into ten bins of equal width; ``right`` (N,) are correct."""
     number = np.clip(np.ceil(confidences * NUM_BINS).astype(int) - 1, 0, NUM_BINS - 1)
     bins = []
     for index in range(NUM_BINS):
@@ -339,7 +343,10 @@ def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> t
 
 
 def calibration_error(bins: Sequence[Bin]) -> float:
-    """Return the expected calibration error: mean |confidence - share of correct poses|."""
+    """Return the expected calibration error.
+
+    It is |mean confidence - share of correct poses|, averaged over bins, weighted by their poses.
+    """
     filled = [b for b in bins if b.num_poses]
     total = sum(b.num_poses for b in filled)
     distances = (abs(b.share_right - b.mean_confidence) * b.num_poses for b in filled)

@@ -41,7 +41,7 @@ from megloc_kapture.values import (
 Read = TypeVar("Read")
 Poses = Mapping[str, RigidTransform]
 
-# parts of a workspace. The map's keypoints are those that queries were matched with
+# parts of a workspace, the preferred map first
 _MAPS = ("map", "preprocessed/mapping", "mapping")
 _QUERY, _QUERY_MATCHES = "query", "matches/query"
 _QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
@@ -60,7 +60,8 @@ class ResultContext:
     queries, mapping : images and cameras, with keypoints and matches; the map has poses.
     refinements : query -> steps of refining its pose.
     consistency : checks of refiners on the map's own images.
-    localized : image -> pose, of results in memory; ``cameras`` of queries that are in no folder.
+    localized : image -> pose, of results in memory.
+    cameras : image -> camera, of queries that are in no folder.
     """
 
     queries: KaptureFolder | None = None
@@ -142,9 +143,9 @@ class Result:
     Attributes
     ----------
     images : queries of the result, sorted; for a pose file only those with a pose.
-    confidences : confidences of poses without a status, from a pose file's JSON file.
+    confidences : confidences of poses without a status, from the JSON file next to a pose file.
     covariances : image -> (6, 6), as in ``Pose``.
-    by_pair : poses of the queries of MLAD's pairs, if the result is such a pose file.
+    by_pair : pair -> ``cam_from_world`` of its query, if the result is MLAD's pose files.
     """
 
     label: str
@@ -174,8 +175,8 @@ def read_result(
 ) -> Result:
     """Read a kapture folder, a pose file, a COLMAP model, or MLAD's pose files.
 
-    Short names in a pose file are matched with ``images``; MLAD's pose files need the poses of the
-    map's images, ``references``.
+    Names in a pose file that are only the end of an image's path are completed by ``images``.
+    MLAD's pose files need ``references``, the poses of the map's images.
     """
     path = Path(source)
     is_mlad = benchmark.protocol.pose_file == "mlad"

@@ -1,8 +1,8 @@
-"""Errors, outcomes and recall of one result, by absolute poses or by MLAD's pairs.
+"""Errors, outcomes and recall of one result, by absolute poses or by the pairs of MLAD.
 
-The MLAD challenges score ``|t - t_true|`` of ``query_from_reference`` for pairs of images. That
-length mixes the error of the camera centre with the error of the rotation times the distance of the
-two cameras, so the error of the centre is reported too.
+The MLAD challenges (4Seasons relocalization) score ``|t - t_true|`` of ``query_from_reference`` for
+pairs of images. That length mixes the error of the camera centre with the rotation error times the
+distance between the two cameras, so the error of the centre is reported too.
 """
 
 from __future__ import annotations
@@ -53,14 +53,15 @@ _COLUMNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class QueryResult(LocalizationResult):
-    """Result of one query against its true pose; the pose includes fallbacks.
+    """Result of one query compared with its true pose; its pose may be a fallback.
 
     Attributes
     ----------
-    image : the query; in an evaluation of pairs, the name of the pair unless it is shown.
+    image : name of the query; in an evaluation of pairs, the name of the pair.
     outcome : ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
-    position_m, angle_deg : errors; infinite without a pose, NaN without a true pose.
-    truth, color, meaning : for reports, see ``shown_queries``.
+    position_m, angle_deg : errors; infinite without a pose and for a query that shows nothing of
+        the map, NaN in a comparison without ground truth.
+    truth, color, meaning : for reports, see :func:`~.report.queries.shown_queries`.
     """
 
     image: str
@@ -119,7 +120,7 @@ class Reported:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evaluation(Reported):
-    """One result; without true poses ``truth`` and ``thresholds`` are empty.
+    """Evaluation of one result; without true poses ``truth`` and ``thresholds`` are empty.
 
     Attributes
     ----------
@@ -127,12 +128,14 @@ class Evaluation(Reported):
     members : row name -> mask (N,) of its queries.
     queries, errors : N counted queries, sorted by name, and their errors.
     truth, estimated : ``cam_from_world`` of counted queries.
-    without_truth, not_scored : images that are reported but not counted, sorted.
+    without_truth : images or pairs without a true pose, sorted; reported but not counted.
+    not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
     truth_known_by : owner of true poses that are not published.
     pairs : name of a query -> its pair, for the MLAD challenges.
-    nowhere : queries that show nothing of the map; correct without a pose, and in no row.
-    by_center : evaluation of MLAD's pairs by the distance of camera centres.
-    covariance : ``num_poses`` with a covariance, and ``num_within`` its 95 % region.
+    nowhere : queries that show nothing of the map, in no row of recall; a pose of one is wrong.
+    by_center : the same pairs of MLAD, evaluated by the error of the camera centre.
+    covariance : counts of localized poses: ``num_poses`` have a covariance, ``num_within`` have the
+        true pose in its 95 % region.
     alignment : note on how the poses were, or could be, aligned with the truth.
     """
 
@@ -227,7 +230,10 @@ def evaluate_poses(
             f"{min(both)!r} has a true pose, but is listed as showing nothing of the map"
         )
     counted = tuple(sorted(benchmark.scored(truth)))
-    require(counted, "no query with a true pose to count: is this the right ground truth?")
+    require(
+        counted,
+        "no query with a true pose counts in this benchmark: is this the right ground truth?",
+    )
     thresholds = tuple(thresholds or benchmark.thresholds())
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
@@ -323,11 +329,11 @@ def evaluate_pairs(
     *,
     thresholds: Sequence[Threshold] | None = None,
 ) -> Evaluation:
-    """Evaluate by MLAD's metric: every pair counts once, and each file is a condition.
+    """Evaluate by MLAD's metric: every pair counts once; of several files, each is a condition.
 
-    A pair is named like its query; if that is in several pairs, with reference and file as well.
-    Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the relative
-    translation; ``by_center`` has the distances of the camera centres.
+    A pair has the name of its query; a query in several pairs is named "QUERY from REFERENCE,
+    FILE". Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the
+    relative translation; ``by_center`` has those of the camera centre.
     """
     pairs, estimated = benchmark.pairs, result.poses_of_pairs(benchmark.pairs)
     absent = next((pair for pair in pairs if pair.reference not in references), None)

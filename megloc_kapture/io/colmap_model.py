@@ -21,8 +21,8 @@ from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransfor
 
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
-_RIG_FILES = ("rigs", "frames")  # since COLMAP 4
-# distortion-free models with another name in kapture, and the zeros to append
+_RIG_FILES = ("rigs", "frames")  # since COLMAP 3.12
+# models that kapture lacks: an equivalent with distortion, and the number of zeros to append
 _SAME_AS = {"SIMPLE_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", 1), "FISHEYE": ("OPENCV_FISHEYE", 4)}
 # records of variable length: bytes before the item count, its type, bytes per item
 _RECORDS = {
@@ -36,9 +36,9 @@ _RECORDS = {
 class SparsePoints:
     """Points of a model and their observations.
 
-    ``point_ids`` are ascending rows of ``xyz``, ``image_ids`` positions in the model's images,
-    ``feature_ids`` may have gaps and repeat a point; ``xy_px`` has the first pixel's centre at
-    (0.5, 0.5).
+    ``point_ids`` are ascending row numbers of ``xyz``, ``image_ids`` positions in the model's
+    images. Not every feature of an image has an observation, and several may observe one point.
+    ``xy_px`` has the first pixel's centre at (0.5, 0.5).
     """
 
     xyz: NDArray[np.float64]
@@ -71,7 +71,7 @@ class SparsePoints:
 
     @classmethod
     def joined(cls, parts: Sequence[SparsePoints]) -> SparsePoints:
-        """Concatenate points of models with one image list and consistent feature ids."""
+        """Concatenate the points of models that share one image list and numbering of features."""
         firsts = np.cumsum([0, *(len(part) for part in parts)])
         moved = [
             replace(part, point_ids=part.point_ids + first)
@@ -94,7 +94,8 @@ class ColmapModel:
     """One reconstruction, with images sorted by id.
 
     ``points.image_ids`` are positions in ``images``, not COLMAP's ids. ``cams_from_rig`` is by rig
-    and camera id; ``frames`` maps image ids to frames, the images of a rig at one time.
+    id, then camera id; ``frames`` maps image ids to frame ids. A frame is the images of a rig at
+    one time.
     """
 
     cameras: dict[int, Camera]

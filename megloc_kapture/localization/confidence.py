@@ -27,14 +27,14 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 Floats = NDArray[np.float64]
 _SAMPLE = 3  # matches that determine a pose
 _CELL = 0.01  # cell size as a share of the image's diagonal; a cell's inliers count once
-# a small wrong map is consistent with itself, so poses with fewer visible points are doubtful
+# a handful of wrong map points can agree with each other, so poses that see fewer are doubtful
 _MIN_VISIBLE = 50
 _MAX_PROJECTED = 2048  # number of points that estimate the visible share
 _MIN_ERROR_PX = 0.5
 _MIN_NOISE_PX = 0.3  # smallest map noise, pixels of the query
 # largest usual ratio of an image's error to the map's noise, measured with more than _FEW inliers
 _USUAL_RATIO, _FEW = 2.9, 20
-# tolerated motion by a wrong focal length, as a share of the distance to the points
+# tolerated shift of the camera by a wrong focal length, relative to the distance of the points
 _TOLERATED_SHIFT = 0.03
 
 TERMS: dict[str, str] = {
@@ -67,8 +67,8 @@ class MatchSources:
     noise : float64 (N, 2), the map's median reprojection error as angle and in pixels; NaN if
         unknown.
     seen : per view the points (K, 3) observed by the cluster's map images.
-    displacements_rad : returns the displacements of map image patches from a pose's projections,
-        see :func:`~.structure.displacements_rad`.
+    displacements_rad : function of a pose that returns the angles between the inliers' projected
+        points and their image patches, see :func:`~.structure.displacements_rad`; or None.
     """
 
     support: NDArray[np.int64]
@@ -125,8 +125,8 @@ def with_confidence(
 ) -> Pose | Failure:
     """Return the pose with its confidence and evidence, or a Failure if the confidence is too low.
 
-    A misfitting focal length shifts the camera, and the confidence falls with the square of this
-    shift.
+    A wrong focal length (``misfit``) shifts the camera. The confidence is divided by the square of
+    this shift relative to 3 % of the distance to the points, if it is larger.
     """
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
@@ -200,14 +200,15 @@ def _misfit(
 ) -> float:
     """Return by how much the inliers fit worse than the map's own images, at least 0.
 
-    A mirrored or similar scene has hundreds of inliers that almost fit. The ratio is the inliers'
-    median angular error over the error expected from map and points. If the median displacement of
-    their image patches is smaller, it replaces the error, since keypoints move at night. The result
-    is log(ratio / usual ratio) log(number / 20), or 0 if the map's noise is unknown.
+    A mirrored or similar scene has hundreds of inliers that almost fit. The ratio is the median of
+    the inliers' reprojection errors divided by the errors expected from the noise of the map and
+    the covariances of the points. If the inliers' image patches are displaced less than their
+    keypoints, the ratio is that of the displacements, since at night detectors fire elsewhere. The
+    result is log(ratio / usual ratio) log(number / 20), or 0 if the map's noise is unknown.
     """
     lengths = np.diff(problem.starts)
     focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)
-    # noise is an angle if the query is sharper than the map's images, else it is in pixels
+    # expected noise in the query's pixels; the angle counts if the query has more pixels per radian
     noise_rad, noise_px = sources.noise.T
     own_px = np.maximum(noise_rad * focals, np.maximum(noise_px, _MIN_NOISE_PX))
     # points of small parallax have larger errors in images from other viewpoints
@@ -285,7 +286,7 @@ OF_ALL = "all"
 
 @lru_cache(maxsize=1)
 def calibrations() -> Mapping[str, Calibration]:
-    """Return the package's calibrations by prefix of keypoints types, and :data:`OF_ALL`."""
+    """Return the calibrations by the beginning of the keypoints type; :data:`OF_ALL` for others."""
     text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
     return {
         name: Calibration(table["origin"], table["bias"], table["weights"])

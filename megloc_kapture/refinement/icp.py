@@ -54,8 +54,9 @@ _SAME_VIEW_M, _SAME_VIEW_DEG = 0.2, 10.0
 class IcpOptions(Options):
     """Options of the refinement by ICP.
 
-    The finest distance is three standard deviations of a structured-light sensor's depth at the end
-    of its range, 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et al., 3DIMPVT 2012, eq. 4).
+    The last of ``max_distances_m`` is three standard deviations of a structured-light sensor's
+    depth at the end of its range, 4 m. The deviation is 0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen et
+    al., 3DIMPVT 2012, eq. 4).
     """
 
     voxels_m: tuple[float, ...] = Field(
@@ -66,8 +67,8 @@ class IcpOptions(Options):
     max_distances_m: tuple[float, ...] = Field(
         default=(0.3, 0.15, 0.075),
         min_length=1,
-        description="largest distances of corresponding points, metres, one per voxel size; the "
-        "finest also defines the overlap",
+        description="largest distance between corresponding points, metres, one per voxel size; "
+        "the overlap is the share of the query's points within the last",
     )
     depth: DepthCloudOptions = Field(
         default_factory=DepthCloudOptions, description="limits of trusted depths"
@@ -85,8 +86,8 @@ class IcpOptions(Options):
     )
     accept_always: bool = Field(
         default=False,
-        description="accept every refined pose without tests of overlap, residual, movement and "
-        "condition",
+        description="accept refined poses without tests of overlap, residual, movement and "
+        "condition number, unless it is infinite",
     )
     min_points: int = Field(
         default=1000,
@@ -97,8 +98,8 @@ class IcpOptions(Options):
         default=0.5,
         ge=0,
         le=1,
-        description="smallest share of the query's points on the map after refinement, and within "
-        "the coarsest distance before it",
+        description="smallest share of the query's points within the first of max_distances_m of "
+        "the map before refinement, and within the last after it",
     )
     max_moved_m: float = Field(
         default=0.3, gt=0, description="largest accepted movement of the centre, metres"
@@ -202,8 +203,8 @@ def _reason_to_skip(
     spacing, limit = levels[-1].surface.spacing(), options.max_distances_m[-1]
     if spacing > limit:
         return (
-            f"the map is too sparse here: {NORMAL_NEIGHBOURS} points span {spacing:.3f} m, "
-            f"at most {limit:g} m is allowed"
+            f"the map is too sparse here: the {NORMAL_NEIGHBOURS} nearest points reach "
+            f"{spacing:.3f} m, at most {limit:g} m is allowed"
         )
     reach = levels[0].fit(local_from_cam, options).reach
     if reach < options.min_overlap:
@@ -267,7 +268,7 @@ def _reason_to_refuse(
             f"the surfaces do not determine the pose: condition number {condition:.0f}, "
             f"at most {options.max_condition:g} is allowed"
         )
-    # voxels follow the world's axes, so shares of points depend on the voxel grid
+    # the overlap varies with the voxel grid: tolerate two binomial standard deviations
     noise = 2 * math.sqrt(before.overlap * (1 - before.overlap) / num_points)
     if after.overlap < before.overlap - noise:
         return f"the overlap fell from {before.overlap:.4f} to {after.overlap:.4f}"
@@ -290,7 +291,8 @@ def map_cloud(
     """Return the map's points (M, 3) around a query under its estimated pose.
 
     They come from the depth maps of the references with most overlap, of which none are within
-    0.2 m and 10 deg of each other. Without depth maps they are the references' sparse points.
+    0.2 m and 10 deg of each other. Without depth maps they are the map points that the references
+    observe, which must be dense.
     """
     margin_m = options.max_distances_m[0]
     low, high = query_points.min(axis=0) - margin_m, query_points.max(axis=0) + margin_m
@@ -368,7 +370,7 @@ def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDA
 
 
 class Icp:
-    """Plugin ``icp``, which fits the query's depth to the map's depth, or to its dense points."""
+    """Plugin ``icp``, which fits the query's depth to the references' depth or dense points."""
 
     name = "icp"
     Options = IcpOptions

@@ -73,7 +73,8 @@ def observed_keypoints(
 ) -> list[ObservedKeypoints]:
     """Read stored keypoints of posed images.
 
-    Points lifted from a single keypoint fit it exactly and are left out if the map has others.
+    Points with a single observation (lifted from depth) reproject exactly onto it, so they are left
+    out unless the map has no others.
     """
     data, keypoints = folder.read(), folder.keypoints(index.local_type)
     poses = data.poses()
@@ -92,9 +93,10 @@ def observed_keypoints(
 
 
 def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
-    """Add the median angle and distance between observations and points, from a sample of images.
+    """Add the map's median reprojection error, as an angle and in pixels, of a sample of images.
 
-    Points lifted from a single keypoint are left out, because they fit it exactly.
+    Points with a single observation are left out, because they reproject exactly onto it; if the
+    map has no others, the index is returned unchanged.
     """
     if index.seen_once[index.point_ids].all() or index.local_type not in folder.types("keypoints"):
         return index
@@ -138,7 +140,10 @@ def open_index(folder: Path) -> MapIndex:
 def shared_index(
     indices: Mapping[str, MapIndex], scratch: Path | None = None
 ) -> Iterator[dict[str, Path]]:
-    """Share indices by keypoints type as temporary folders; open indices stay valid afterwards."""
+    """Write indices, by keypoints type, to temporary folders that other processes can open.
+
+    Opened indices stay valid after the folders are removed.
+    """
     with TemporaryDirectory(prefix=TEMPORARY, dir=scratch) as place:
         folders = {name: Path(place) / str(at) for at, name in enumerate(indices)}
         for name, folder in folders.items():
@@ -159,7 +164,8 @@ Unit = tuple[tuple[str, RigidTransform], ...]
 def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
     """Group query images into units that are localized together, sorted by image.
 
-    With ``rigs`` a unit is the cameras of one rig (the first by name) at one timestamp.
+    With ``rigs`` a unit is the images of one rig at one timestamp; a camera on several rigs belongs
+    to the first by name.
     """
     carried = _carried(data) if rigs else {}
     rigs_of = _rigs_of(carried)

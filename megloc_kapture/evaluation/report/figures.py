@@ -26,7 +26,7 @@ from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.values import RigidTransform
 
 _INK, _MUTED, _MISS = "#1f2933", "#9aa5b1", "#c0262d"
-# Okabe and Ito's palette for any colour vision and print, and four more for RobotCar's conditions
+# six colours of Okabe and Ito's colour-blind-safe palette, and four more for RobotCar's conditions
 _PALETTE = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
     *("#7a5195", "#8c6d31", "#5f6b7a", "#9a1750"),
@@ -168,7 +168,7 @@ def confidence_curves(confidence: Confidence) -> bytes:
         for x, y, b in zip(mean, share, filled, strict=True):
             where: dict[str, Any] = {"xytext": (0, 6), "textcoords": "offset points"}
             reliability.annotate(str(b.num_poses), (x, y), ha="center", fontsize=7, **where)
-        reliability.set(xlabel="confidence (%)", ylabel="right poses (%)")
+        reliability.set(xlabel="confidence (%)", ylabel="correct poses (%)")
         reliability.set(xlim=(-2, 104), ylim=(-2, 110))
         coverage, risk = 100 * np.array(confidence.coverage), 100 * np.array(confidence.risk)
         curve.step(coverage, risk, where="post", color=_INK)

@@ -1,8 +1,8 @@
 """Matches between two images, and pairs of images to match.
 
-kapture stores the matches of a pair under its lexicographically smaller name, as float64 (M, 3):
-index, index, score. Its own writers do not order the pair, so both orders are read. Pairs files are
-kapture-localization's: query image, map image, score.
+kapture's format stores the matches of a pair as SMALLER.overlapping/LARGER.matches, ordered by
+name, in float64 rows (M, 3): index, index, score. kapture's own writers do not order the names, so
+both orders are read. Pairs files are kapture-localization's: query image, map image, score.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MAX_INDEX = 2**53
 
 
 class MatchesReader:
-    """Matches of one keypoints type from one or several folders; the first match file is used."""
+    """Matches of one keypoints type from several folders; the first that has a pair is used."""
 
     def __init__(self, type_name: str, folders: Sequence[Path]) -> None:
         self.type_name = type_name
@@ -101,13 +101,13 @@ class MatchesReader:
 
 
 class MatchesWriter(BlobWriter):
-    """Writer for matches of one keypoints type, a context manager; files are atomic."""
+    """Context manager that writes matches of one keypoints type, each file atomically."""
 
     def __init__(self, root: Path, type_name: str, *, orphan: bool = False) -> None:
         self.type_name = type_name
         folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
         try:
-            # kapture lists a type by its folder, even without pairs
+            # kapture finds a type by its folder, so it exists even if no pair is written
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise output_error(folder, error) from error
@@ -135,7 +135,7 @@ PAIRS_HEADER = "# query_image, map_image, score"
 
 @dataclass(frozen=True, order=True, slots=True)
 class ImagePair:
-    """Two images to match; pairs with higher scores come first."""
+    """Two images to match; a higher score is a better candidate."""
 
     query: str
     map: str
