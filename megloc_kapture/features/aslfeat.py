@@ -1,7 +1,8 @@
 """ASLFeat local features (Luo et al., CVPR 2020), for the official checkpoint after conversion.
 
-The network is for inference only: batch normalisation is folded into the convolutions. Parameters
-keep TensorFlow's names, written in torch's notation (``scripts/convert_weights.py``).
+The network is for inference only: batch normalisation is folded into the convolutions, except for
+``conv1`` and ``conv3``, whose outputs before normalisation are scored. Parameters keep TensorFlow's
+names, written in torch's notation (``scripts/convert_weights.py``).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class NetworkOptions(Options):
     device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
     half_precision: bool = Field(
         default=False,
-        description="compute in float16 on a GPU, bfloat16 on a CPU, except for keypoints",
+        description="compute in float16 on a GPU, bfloat16 on a CPU, except for keypoint positions",
     )
 
 

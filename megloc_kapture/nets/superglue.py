@@ -23,7 +23,7 @@ from megloc_kapture.nets.runtime import load_strictly
 
 _HEADS = 4
 _LARGEST_SCALE = 2.0e4  # scales above this or below its inverse are absorbed into the potentials
-_SMALLEST_ENTRY = 1e-30  # lower bound of the kernel's entries, which avoids slow subnormal products
+_SMALLEST_ENTRY = 1e-30  # smaller kernel entries become 0, which avoids slow subnormal products
 _PADDING = -1e30  # log score of padding: no mass, but unlike infinity a finite gradient
 
 

@@ -21,7 +21,7 @@ from megloc_kapture.geometry.cameras import bearing_rays, in_image, project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
-# depth samples along the longer side of a depth map; at 640 px, six per point chosen from them
+# depth samples along the longer side of a depth map: six per chosen point at a level of 640 px
 _GRID = 320
 # larger second differences of inverse depth, relative to it, are edges; on planes they are zero
 _JUMP = 0.05

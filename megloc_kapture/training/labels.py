@@ -61,8 +61,8 @@ def labels_of_views(
 ) -> Labels:
     """Label keypoints (N, 2) and (M, 2) by depth and poses.
 
-    A keypoint without depth is unmatched if it is farther than NEGATIVE_PX (Sampson distance)
-    from the epipolar curves of all keypoints of the other image that depth leaves ignored.
+    A keypoint without depth is unmatched if its Sampson distance from all keypoints of the other
+    image that depth leaves ignored is larger than NEGATIVE_PX, else ignored.
     """
     a_in_b, known_a, visible_a = reproject(px_a, a, b)
     b_in_a, known_b, visible_b = reproject(px_b, b, a)

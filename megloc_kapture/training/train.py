@@ -61,7 +61,7 @@ class TrainingOptions(NetworkOptions):
     """Options of training SuperGlue on a frozen extractor's features."""
 
     half_precision: bool = Field(
-        default=False, description="bfloat16, except for keypoints, transport and loss"
+        default=False, description="bfloat16, except for keypoint positions, transport and loss"
     )
     features: PluginChoice = PluginChoice(name="superpoint")
     max_keypoints: int = Field(default=512, gt=0, description="number of best keypoints per image")
@@ -83,7 +83,8 @@ class TrainingOptions(NetworkOptions):
         default=50, gt=0, description="iterations in training and evaluation"
     )
     matcher_weights: str | None = Field(
-        default=None, description="initial SuperGlue; none: random weights"
+        default=None,
+        description="initial SuperGlue; none: a new network that starts as nearest neighbours",
     )
     check_every: int = Field(
         default=1000, gt=0, description="steps between evaluations and checkpoints"
