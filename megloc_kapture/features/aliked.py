@@ -1,8 +1,9 @@
 """ALIKED local features (Zhao et al., IEEE TIM 2023), with the official parameter names.
 
-The network is for inference only: batch normalisation is folded into the convolutions. The 128
-channels are never computed at full resolution: the score head's first layer, a matrix product per
-pixel, is applied to each level before upsampling, and descriptors are sampled at keypoints only.
+The network is for inference only: batch normalisation is folded into the convolutions. The features
+of all levels (64 or 128 channels) are never concatenated at full resolution: the score head's first
+layer, a matrix product per pixel, is applied to each level before upsampling, and descriptors read
+the features around keypoints only.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from megloc_kapture.values import LocalFeatures
 
 _TEMPERATURE = 0.1  # softmax temperature of the sub-pixel position, as in training
 _MULTIPLE = 32
-_STRIP_ROWS = 2  # image rows per block of the score head's first layer, which fits the CPU's cache
+# image rows per strip in the score head's first layer; a strip of two rows fits the CPU's cache
+_STRIP_ROWS = 2
 _PATCH = 3
 _VALUES_AT_ONCE = {"cpu": 1 << 23, "cuda": 1 << 28}
 
@@ -56,7 +58,7 @@ class Aliked(LocalNetwork[AlikedOptions]):
 
     def __init__(self, options: AlikedOptions | None = None) -> None:
         super().__init__(options)
-        # the type name contains the model: descriptors of different models do not match
+        # each model has its own feature type, since descriptors of different models do not match
         self.name = Path(self._weights.name).stem
 
     @property
@@ -139,7 +141,7 @@ class AlikedNet(nn.Module):
         for k in range(len(images)):
             levels = [level[k : k + 1] for level in coarse]
             fine = _level(level1[k : k + 1])
-            # half precision would tie scores, and ties make duplicate keypoints
+            # half precision would make neighbouring scores equal, and equal maxima are all kept
             with torch.autocast(images.device.type, enabled=False):
                 scores = torch.sigmoid(self._score_logits(fine, levels)[0, 0])
             scores = scores[top : top + height, left : left + width]
@@ -160,7 +162,7 @@ class AlikedNet(nn.Module):
             sums = enlarged if sums is None else sums.add_(enlarged)
         assert sums is not None
         by_pixel = sums.permute(0, 2, 3, 1).reshape(len(fine.table), -1)
-        # strips stay in a processor's cache; a GPU would only launch more kernels
+        # on a CPU, a strip stays in the cache; on a GPU, strips would only add kernel launches
         rows = _STRIP_ROWS if by_pixel.device.type == "cpu" else fine.size[0]
         at_once = rows * fine.size[1]
         for strip, into in zip(
@@ -170,7 +172,7 @@ class AlikedNet(nn.Module):
         return self.score_head[1:](by_pixel.view(1, *fine.size, -1).permute(0, 3, 1, 2))
 
     def fine_tap(self, level1: torch.Tensor) -> torch.Tensor:
-        """Return features (N, D / 4) of the finest level for rows (N, C) of the first block."""
+        """Return the finest level's features (N, D / 4) for activations (N, C) of ``block1``."""
         return functional.selu(level1 @ self.conv1.weight[:, :, 0, 0].T, inplace=True)
 
 
@@ -182,11 +184,11 @@ class _Level:
 
 @dataclass(frozen=True, eq=False)
 class AlikedMaps:
-    """Score map float32 (H, W) in (0, 1) of an image, and features that are sampled at pixels."""
+    """Score map of an image, float32 (H, W) in (0, 1), and feature levels to sample at pixels."""
 
     _net: AlikedNet
     scores: torch.Tensor
-    _origin: tuple[int, int]  # row and column of the image's first pixel in the padded levels
+    _origin: tuple[int, int]  # row and column of the image's first pixel in the padded image
     _fine: _Level
     _coarse: list[_Level]
 
@@ -279,7 +281,10 @@ class DescriptorHead(nn.Module):
         self.sf_conv = nn.Conv2d(size, size, 1, bias=False)
 
     def forward(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
-        """Return unit-norm descriptors float32 (N, D) at xy (N, 2); pixel centres are integers."""
+        """Return unit-norm descriptors float32 (N, D) at xy (N, 2).
+
+        The centre of the first pixel is (0, 0).
+        """
         size = self.agg_weights.shape[1]
         at_once = _VALUES_AT_ONCE[xy.device.type] // (4 * self.positions * size)
         parts = [self._describe(maps, part) for part in torch.split(xy, max(at_once, 1))]
@@ -288,8 +293,8 @@ class DescriptorHead(nn.Module):
     def _describe(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
         height, width = maps.scores.shape
         number, size = len(xy), self.agg_weights.shape[1]
-        # the patch is centred on the keypoint's pixel; as published, it avoids the last row and
-        # column
+        # the patch is centred on the keypoint's pixel, but clamped as in the published code, which
+        # excludes the last row and column
         left = (xy[:, 0].long() - 1).clamp(0, width - 1 - _PATCH)
         top = (xy[:, 1].long() - 1).clamp(0, height - 1 - _PATCH)
         side = torch.arange(_PATCH, device=xy.device)

@@ -1,7 +1,8 @@
-"""ASLFeat local features (Luo et al., CVPR 2020), with the official checkpoint converted.
+"""ASLFeat local features (Luo et al., CVPR 2020), for the official checkpoint after conversion.
 
-The network is for inference only: batch normalisation is folded into the convolutions. Parameters
-keep TensorFlow's names, written in torch's notation (``scripts/convert_weights.py``).
+The network is for inference only: batch normalisation is folded into the convolutions, except for
+``conv1`` and ``conv3``, whose outputs before normalisation are scored. Parameters keep TensorFlow's
+names, written in torch's notation (``scripts/convert_weights.py``).
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from megloc_kapture.nets.score_maps import (
 from megloc_kapture.values import LocalFeatures
 
 DESCRIPTOR_SIZE = 128
-STRIDE = 4  # cell (i, j) of the descriptor map is centred at pixel (4 i, 4 j)
+STRIDE = 4  # the descriptor map is sampled as if its cell (i, j) were centred at pixel (4 i, 4 j)
 # layers that add to the score map: dilation of the neighbourhood, and weight in the sum
 _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
@@ -67,7 +68,8 @@ class AslFeatOptions(LocalNetworkOptions):
     )
     multi_scale: bool = Field(
         default=False,
-        description="also extract at 1/sqrt(2) and 1/2 of the image size, against scale changes",
+        description="also extract at 1/sqrt(2) and 1/2 of the image size, to match images of "
+        "different scale; small images have fewer scales",
     )
 
 
@@ -258,7 +260,9 @@ def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
     for name in _SCORED:
         scale = float(net.get_buffer(f"tower.{name}.instance_max"))
         if not 0 < scale < float("inf"):
-            raise DataError(f"tower/{name}/instance_max is {scale}, not positive", path=where)
+            raise DataError(
+                f"tower/{name}/instance_max is {scale}, not a positive number", path=where
+            )
     return net.eval()
 
 

@@ -1,4 +1,4 @@
-"""Global features by networks: NetVLAD, OpenIBL, AP-GeM, DELG and MegaLoc.
+"""Global features of networks: NetVLAD, OpenIBL, AP-GeM, DELG and MegaLoc.
 
 Plugins of group ``megloc_kapture.global_features`` with the authors' weights: NetVLAD (Arandjelovic
 et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al., ICCV 2019), DELG
@@ -41,7 +41,7 @@ from megloc_kapture.nets.runtime import (
 Tensors = Mapping[str, torch.Tensor]
 
 _OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX = 640, 480
-_MEGALOC_SIZE_PX = 322  # the paper's, section 4
+_MEGALOC_SIZE_PX = 322  # side of the input image in section 4 of the paper
 
 
 class GlobalNetworkOptions(NetworkOptions):
@@ -52,7 +52,7 @@ GlobalOptions = TypeVar("GlobalOptions", bound=GlobalNetworkOptions)
 
 
 class GlobalNetwork(Checkpointed[GlobalOptions]):
-    """Global features by a network with a checkpoint; the type name contains method and model."""
+    """Base of global features; the type name contains the method and the checkpoint's name."""
 
     name: str
     method: ClassVar[str]
@@ -129,7 +129,7 @@ class OpenIblOptions(GlobalNetworkOptions):
         default=None,
         ge=STRIDE_PX,
         description="longer side of the input, aspect ratio kept, smaller images not enlarged; "
-        "None: 640 x 480 for all images, as in training",
+        "none: 640 x 480 for all images, as in training",
     )
 
 
@@ -223,7 +223,7 @@ class DelgOptions(GlobalNetworkOptions):
     scales: tuple[float, ...] = Field(
         default=(0.70710677, 1.0, 1.4142135),
         min_length=1,
-        description="scales whose vectors are summed; each is a run of the network",
+        description="image scales whose vectors are summed; the network runs once per scale",
     )
 
 
@@ -256,9 +256,9 @@ class MegaLocOptions(GlobalNetworkOptions):
     weights: str = Field(default="megaloc", description="name in the registry, or a file")
     size_px: int = Field(
         default=_MEGALOC_SIZE_PX,
-        ge=9 * PATCH_PX,  # fewer patches would leave clusters empty
+        ge=9 * PATCH_PX,  # 81 patches: SALAD needs more patches than its 64 clusters
         multiple_of=PATCH_PX,
-        description="width and height of the network's input; must be equal for map and queries",
+        description="side of the network's square input; use the same for map and queries",
     )
 
 

@@ -1,7 +1,7 @@
 """Size limit of images for local feature extraction.
 
-Memory grows with the pixels: RootSIFT and ALIKED take about 0.25 GB per megapixel. Larger images
-are reduced first, and their keypoints scaled back.
+Memory grows with the number of pixels: RootSIFT and ALIKED take about 0.25 GB per megapixel. Images
+above the limit are reduced first, and their keypoints scaled back.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class BoundedOptions(Options):
         default=DEFAULT_MEGAPIXELS,
         gt=0,
         allow_inf_nan=False,
-        description="larger images are reduced to this for extraction, and keypoints scaled back; "
-        "memory grows with it",
+        description="larger images are reduced to this size for extraction, and keypoints scaled "
+        "back; memory grows with the number of pixels",
     )
 
 
@@ -57,10 +57,10 @@ def max_megapixels_of(extractor: object) -> float:
 
 
 def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatures]:
-    """Extract from images of one size, reduced to the extractor's limit.
+    """Extract from images of equal size, reduced to the extractor's limit.
 
     Keypoints are in pixels of the given images. A pixel of a reduced mask is usable if all pixels
-    that it covers are. For several images the extractor needs ``extract_many``.
+    that it covers are. For more than one image the extractor needs ``extract_many``.
     """
     bound = max_megapixels_of(extractor)
     small = [_reduced(*frame, bound) for frame in frames]

@@ -27,8 +27,8 @@ from megloc_kapture.nets.kornia_networks import (
 from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.values import LocalFeatures
 
-_XFEAT_STRIDE_PX = 32  # XFeat rounds image sides down to multiples of it
-_ALL = 1 << 30  # detect all keypoints, since the mask is applied before the selection
+_XFEAT_STRIDE_PX = 32  # XFeat rounds image sides down to multiples of 32 pixels
+_ALL = 1 << 30  # detect all keypoints, since the mask is applied before the best are selected
 
 
 class _KorniaFeatures(LocalNetwork[LocalOptions]):
@@ -94,7 +94,10 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
 
 
 def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
-    """Return the offset (x, y) from kornia's pixels to COLMAP's; kornia resizes images first."""
+    """Return the offset (x, y) from kornia's pixel coordinates to COLMAP's, in image pixels.
+
+    It is half a pixel of the image that kornia resizes for XFeat.
+    """
     sides = np.array([shape[1], shape[0]], np.float32)
     resized = np.maximum(sides // _XFEAT_STRIDE_PX, 1) * _XFEAT_STRIDE_PX
     return np.asarray(0.5 * sides / resized, np.float32)

@@ -45,7 +45,7 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 
     @abstractmethod
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
-        """Extract from RGB images of equal size in one batch; results differ only by rounding."""
+        """Extract from RGB images of equal size in one batch, as :meth:`extract` up to rounding."""
 
     def _best(
         self,
@@ -75,6 +75,9 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 def in_image_px(
     xy: NDArray[Any], size: Sequence[int], image_size: Sequence[int]
 ) -> NDArray[np.float32]:
-    """Convert positions (N, 2) in a map to image pixels; the map's first centre is (0, 0)."""
+    """Convert positions (N, 2) in a score map to image pixels.
+
+    The centre of the first pixel is (0, 0) in the map, (0.5, 0.5) in the image.
+    """
     ratio = np.array([image_size[1] / size[1], image_size[0] / size[0]])
     return ((xy + 0.5) * ratio).astype(np.float32)

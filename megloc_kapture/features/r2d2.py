@@ -1,7 +1,8 @@
 """R2D2 local features (Revaud et al., NeurIPS 2019, section 3), the default of kapture's tools.
 
-The network is an L2-Net with dilations instead of strides, so that maps have full resolution, and
-with three 2x2 convolutions in place of the last 8x8 one. It has the official parameter names.
+The network is an L2-Net with dilations instead of strides, so that its output maps have full
+resolution, and with three 2x2 convolutions in place of the last 8x8 convolution. It has the
+official parameter names.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from megloc_kapture.nets.trunks import imagenet_normalised
 from megloc_kapture.values import LocalFeatures
 
 DESCRIPTOR_SIZE = 128
-# kernel, width in units of the base width, dilation; ReLU after 3x3 kernels
+# kernel size, width as a multiple of the base width, dilation; ReLU after 3x3 kernels
 _LAYERS = ((3, 1, 1), (3, 1, 1), (3, 2, 1), (3, 2, 2), (3, 4, 2), (3, 4, 4), (2, 4, 4), (2, 4, 8))
 _STEPS_PER_OCTAVE = 4
-_TOLERANCE = 0.001  # tolerance of a scale, as a side may be rounded down by a pixel
+_TOLERANCE = 0.001  # for comparing scales with their limits, as in the authors' code
 _DEFAULT_WEIGHTS = "r2d2_WASF_N16"
-_PATCH_PX = 32.0  # keypoint scale at full resolution, as in the authors' code
+_PATCH_PX = 32.0  # scale of keypoints at full resolution, as in the authors' code
 
 
 class R2D2Options(LocalNetworkOptions):
@@ -46,15 +47,17 @@ class R2D2Options(LocalNetworkOptions):
     max_keypoints: int = Field(
         default=1500, gt=0, description="number of best keypoints kept; the authors use 5000"
     )
-    min_size: int = Field(default=256, gt=0, description="longer side of the smallest level, px")
-    max_size: int = Field(default=1024, gt=0, description="longer side of the largest level, px")
+    min_size: int = Field(
+        default=256, gt=0, description="smallest longer side of a reduced level, pixels"
+    )
+    max_size: int = Field(default=1024, gt=0, description="largest longer side of a level, pixels")
     min_reliability: float = Field(default=0.7, ge=0, le=1)
     min_repeatability: float = Field(default=0.7, ge=0, le=1)
 
     @model_validator(mode="after")
     def _levels_exist(self) -> R2D2Options:
         if self.max_size < 1.2 * self.min_size:
-            raise ValueError("max_size is at least 1.2 times min_size")
+            raise ValueError("max_size must be at least 1.2 times min_size")
         return self
 
 
@@ -112,13 +115,13 @@ class R2D2(LocalNetwork[R2D2Options]):
 class R2D2Maps(NamedTuple):
     """Maps of images, each (B, C, H, W)."""
 
-    features: torch.Tensor  # C = 128, one descriptor per pixel, normalised
+    features: torch.Tensor  # C = 128, one descriptor per pixel, not normalised
     reliability: torch.Tensor  # C = 1, in [0, 1]: expected matching success of the descriptor
     repeatability: torch.Tensor  # C = 1, in [0, 1]: expected repeatability of a local maximum
 
 
 class R2D2Network(nn.Module):
-    """Dense features, reliability and repeatability; ``base_width``: 32, or 48 if big."""
+    """Dense features, reliability and repeatability; ``base_width`` is 48 in the "big" model."""
 
     def __init__(self, base_width: int = 32) -> None:
         super().__init__()
@@ -160,10 +163,10 @@ def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
 
 
 def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:
-    """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each resized from the last.
+    """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each resized from the previous one.
 
-    This is R2D2's pyramid (Revaud et al., 2019, section 4), with limits on the longer side. An
-    image smaller than ``min_size`` has one level.
+    This is R2D2's pyramid (Revaud et al., 2019, section 4). Levels whose longer side is outside the
+    limits are omitted, except that an image smaller than ``min_size`` has one level.
     """
     height, width = image.shape[-2:]
     longer = max(height, width)

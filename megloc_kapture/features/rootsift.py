@@ -1,8 +1,8 @@
 """SIFT with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012, section 3).
 
-``rootsift`` uses OpenCV's SIFT, 2 to 5 times faster than pycolmap's and as accurate
-(docs/experiments/features.md). ``sift`` is COLMAP's: Lowe's detector (IJCV 2004) by VLFeat with
-byte descriptors, as in official models and their databases.
+``rootsift`` uses OpenCV's SIFT, which is 2 to 5 times faster than pycolmap's and as accurate
+(docs/experiments/features.md). ``sift`` is COLMAP's SIFT: VLFeat's implementation of Lowe's
+detector (IJCV 2004) with byte descriptors, as in the databases of published COLMAP models.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class RootSift:
         options = self.options
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         sift = cv2.SIFT.create(
-            # OpenCV masks after the selection, so no limit is passed with a mask. It cannot
-            # describe the masked keypoints only: if none is in the first octave, it builds
-            # another pyramid
+            # OpenCV applies a mask after the selection, so no limit is passed with a mask.
+            # Describing only the unmasked keypoints in a second call would change descriptors:
+            # if none of them is in the first octave, OpenCV builds another pyramid
             options.max_keypoints if mask is None else 0,
             3,
             options.contrast_threshold,
@@ -98,14 +98,16 @@ class ColmapSiftOptions(BoundedOptions):
     max_keypoints: int = Field(
         default=8192,
         gt=0,
-        description="number of coarsest keypoints kept; COLMAP keeps whole scale levels, so the "
-        "last may exceed it",
+        description="number of coarsest keypoints kept; COLMAP keeps whole scale levels, so that "
+        "there may be more without a mask",
     )
     first_octave: int = Field(
         default=-1, ge=-1, le=5, description="first octave; -1 doubles the image size, 0 keeps it"
     )
     peak_threshold: float = Field(
-        default=0.02 / 3, gt=0, description="smallest difference of Gaussians, of grey in 0..1"
+        default=0.02 / 3,
+        gt=0,
+        description="smallest difference of Gaussians of a keypoint, for grey values from 0 to 1",
     )
 
 

@@ -1,9 +1,9 @@
 """SuperPoint local features (DeTone, Malisiewicz and Rabinovich, CVPR workshops 2018, section 3).
 
 Checkpoints have the keys of Magic Leap's ``superpoint_v1.pth`` or of ``superpoint_v6_from_tf.pth``,
-the MIT-licensed retrained network (rpautrat/SuperPoint). The latter normalises *after* each
-activation, and its descriptors do not work with SuperGlue's weights. Descriptors may come from a
-second checkpoint: MegLoc fine-tunes them with a frozen detector.
+the MIT-licensed retrained network (rpautrat/SuperPoint). The latter applies batch normalisation
+*after* each activation, and its descriptors do not work with SuperGlue's weights. Descriptors may
+come from a second checkpoint: MegLoc fine-tunes them with a frozen detector.
 """
 
 from __future__ import annotations
@@ -34,13 +34,18 @@ from megloc_kapture.values import LocalFeatures
 
 _OFFICIAL_WEIGHTS = "superpoint_v1"
 DESCRIPTOR_SIZE = 256
-_STRIP_ROWS = 64  # even; fastest: fewer rows overlap more, more rows do not fit the CPU's caches
+# image rows per strip, even; 64 is fastest: thinner strips overlap more, thicker ones do not fit
+# the CPU's caches
+_STRIP_ROWS = 64
 DescriptorSampling = Literal["official", "exact"]
-_EPSILON = 1e-3  # TensorFlow's default, as in training
+_EPSILON = 1e-3  # of batch normalisation: TensorFlow's default, as in training
 
 
 class SuperPointOptions(LocalNetworkOptions):
-    """Options of SuperPoint; NMS radius, threshold and border default to the authors' values."""
+    """Options of SuperPoint.
+
+    NMS radius, threshold and border have the defaults of SuperGlue's published code.
+    """
 
     weights: str = Field(
         default=_OFFICIAL_WEIGHTS,
@@ -57,8 +62,8 @@ class SuperPointOptions(LocalNetworkOptions):
     )
     descriptor_sampling: Literal["official", "exact"] = Field(
         default="official",
-        description="official: as the authors of the weights do; Magic Leap's sampling is up to "
-        "3.5 px off, and SuperGlue was trained with it; exact: at the keypoint",
+        description="official: as the authors of the weights do (Magic Leap's sampling is up to "
+        "3.5 px off, and SuperGlue was trained with it); exact: at the keypoint",
     )
 
 
@@ -240,8 +245,9 @@ def sample_descriptors(
     """Sample a descriptor map (D, h, w) bilinearly at pixels (N, 2): unit-norm float32 (N, D).
 
     The first pixel's centre is (0, 0). ``exact`` puts the centre of cell (i, j) at pixel
-    (8 i + 3.5, 8 j + 3.5). ``official`` scales by a factor too small by (w - 1) / (w - 9/16): the
-    error grows to 3.5 pixels at the bottom right. SuperGlue was trained with it.
+    (8 i + 3.5, 8 j + 3.5). ``official`` multiplies the correct scale by (w - 1) / (w - 9/16), and
+    likewise with h, so that the error grows to 3.5 pixels at the bottom right. SuperGlue was
+    trained with it.
     """
     size, height, width = descriptors.shape
     if len(xy) == 0:
@@ -279,7 +285,7 @@ class _Block(nn.Module):
 
 
 class SuperPointBatchNormNet(nn.Module):
-    """The retrained network, with the interface of :class:`SuperPointNet`."""
+    """The retrained network; ``forward`` takes and returns the same as :class:`SuperPointNet`'s."""
 
     official_sampling: DescriptorSampling = "exact"
 

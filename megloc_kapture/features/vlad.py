@@ -26,7 +26,7 @@ from megloc_kapture.values import Options
 Float32 = NDArray[np.float32]
 
 _CHUNK = 16384  # descriptors per block: bounds memory at 16384 x clusters floats
-# whitening is learnt from at most this many images, and this many values (1 GiB of float32)
+# whitening is learnt from at most this many images and this many values (1 GiB of float32)
 _WHITENING_IMAGES = 4096
 _WHITENING_NUMBERS = 1 << 28
 _COLUMNS = 4096  # dimensions per block when whitening is learnt
@@ -35,9 +35,10 @@ _LEAST = 1e-9
 # whitening divides by the standard deviations to this power, as AP-GeM does; with 1, as in Jegou
 # and Chum, all images of a small map are equally dissimilar
 WHITENING_POWER = 0.5
-# sharpness of soft assignment of unit-norm descriptors; 10 makes retrieval worse
+# alpha of soft assignment, for unit-norm descriptors; 10 makes retrieval worse
 ALPHA = 30.0
-# number of training descriptors of a vocabulary, sampled evenly over the images, and of Lloyd steps
+# number of descriptors that train a vocabulary, the same share of each image's; number of Lloyd
+# steps
 TRAINING_DESCRIPTORS, LLOYD_STEPS = 200_000, 20
 
 
@@ -53,8 +54,8 @@ class VladOptions(Options):
     dimensions: int | None = Field(
         default=None,
         gt=0,
-        description="dimensions after PCA whitening, fewer than the map's images; "
-        "none: no whitening",
+        description="dimensions after PCA whitening, reduced to fewer than the number of map "
+        "images; none: no whitening",
     )
     assignment: Literal["hard", "soft"] = "hard"
     seed: int = Field(default=0, ge=0)
@@ -100,13 +101,13 @@ def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> Pc
             "images, or no whitening"
         )
     variances, axes = variances[:kept], axes[:, :kept]
-    # principal axes of unit length (D,), divided by the deviations
+    # combine the vectors to principal axes of unit length (D,), divided by the deviations' power
     rows = (axes / np.sqrt(count * variances) / variances ** (power / 2)).T
     projection = np.empty((kept, size), dtype=np.float32)
     for start in range(0, size, _COLUMNS):
         part = vectors[:, start : start + _COLUMNS].astype(np.float64)
         projection[:, start : start + _COLUMNS] = rows @ part
-    # fix the sign of an axis: its largest entry is positive
+    # fix the sign of each axis: its entry of largest magnitude is positive
     largest = np.take_along_axis(projection, np.abs(projection).argmax(axis=1)[:, None], axis=1)
     projection *= np.where(largest < 0, np.float32(-1), np.float32(1))
     return PcaWhitening(mean, projection)
@@ -138,8 +139,8 @@ def train_vlad(
 ) -> Vocabulary:
     """Train vocabularies, and optionally their whitening, on the images of a map.
 
-    ``length`` returns the number of an image's descriptors, ``read`` the descriptors (N, D).
-    ``each`` maps a function over images, possibly in parallel.
+    ``length`` returns the number of an image's descriptors, ``read`` the descriptors themselves,
+    (N, D). ``each`` maps a function over images, possibly in parallel.
     """
     options = options or VladOptions()
     rows = sample_rows(map(length, images), TRAINING_DESCRIPTORS, options.seed)
@@ -156,7 +157,7 @@ def train_vlad(
     del sampled
     most = min(_WHITENING_IMAGES, max(2, _WHITENING_NUMBERS // vocabulary.size))
     described = [image for image, chosen in zip(images, rows, strict=True) if len(chosen)]
-    if len(described) > most:  # even over the names, so over sequences
+    if len(described) > most:  # pick evenly over the sorted names, and so over sequences
         picks = np.linspace(0, len(described) - 1, most).round().astype(np.int64)
         described = [described[pick] for pick in picks]
     vectors = np.empty((len(described), vocabulary.size), dtype=np.float32)
@@ -246,9 +247,9 @@ def _sum_by_label(
 
 
 def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np.int64]]:
-    """Sample about ``total`` descriptors evenly over the images; return each image's rows.
+    """Sample the same share of each image's descriptors, about ``total`` in all.
 
-    ``counts`` are the images' numbers of descriptors.
+    ``counts`` are the images' numbers of descriptors. Returns the sampled rows of each image.
     """
     counts = list(counts)
     rng = np.random.default_rng(seed)
@@ -264,7 +265,7 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 def aggregate(
     descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
 ) -> Float32:
-    """Compute the VLAD float32 (M,) of descriptors (N, D), of unit norm; zero without any."""
+    """Compute the unit-norm VLAD, float32 (M,), of descriptors (N, D); zero if N is 0."""
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
     if len(data) and data.shape[1] != vocabulary.centres.shape[2]:

@@ -19,7 +19,7 @@ _FLAT = np.float32(1e-6)
 
 @compiled_loop
 def window_sums(image, other, radius, row, columns, sums):
-    """Write sums of image, image^2 and image * other over a row's windows to float32 (3, W)."""
+    """Fill ``sums`` (3, W) with those of image, image^2 and image * other over a row's windows."""
     height, width = image.shape
     for x in range(width):
         columns[0, x] = columns[1, x] = columns[2, x] = np.float32(0)
@@ -48,7 +48,7 @@ def correlate(reference, warped, radius, costs):
     """Compute the matching cost under one plane: 1 - the mean of the two best correlations.
 
     ``warped`` float32 (S, H, W) are the sources warped by the plane. ``costs`` uint8 (H, W) is
-    filled with 255 (1 - ZNCC), at most 255, which also marks pixels that no source sees.
+    filled with 255 (1 - ZNCC), limited to 255. Pixels that no source sees also have the cost 255.
     """
     height, width = reference.shape
     num_sources = len(warped)
@@ -127,7 +127,7 @@ def add_path(cost, grey, p1, p2, edge, dy, dx, total):
 
 @compiled_loop
 def best_labels(total, labels):
-    """Find the fractional label (H, W) of the smallest total, by a parabola."""
+    """Fill ``labels`` (H, W) with the fractional labels of the smallest totals, by a parabola."""
     height, width, depth = total.shape
     for y in range(height):
         for x in range(width):
@@ -151,8 +151,9 @@ def count_agreeing(
 ):
     """Increment ``counts`` where another view's inverse depth (H, W) agrees in both directions.
 
-    ``infinity`` and ``baseline`` project into the other view; ``max_px`` limits the round-trip
-    error, ``max_share`` the relative depth difference.
+    ``infinity`` and ``baseline`` project into the other view, ``back_infinity`` and
+    ``back_baseline`` back into this view. ``max_px`` limits the round-trip error, ``max_share`` the
+    relative depth difference.
     """
     height, width = inverse.shape
     rows, columns = other.shape
@@ -170,26 +171,26 @@ def count_agreeing(
             column, row = int(math.floor(u + 0.5)), int(math.floor(v + 0.5))
             if column < 0 or row < 0 or column >= columns or row >= rows:
                 continue
-            other_depth = float(other[row, column])
-            if other_depth <= 0.0:
+            other_inverse = float(other[row, column])
+            if other_inverse <= 0.0:
                 continue
-            # the other's depth, extrapolated to the projection along the tangent of 1 / depth
+            # extrapolate the other view's inverse depth linearly to the projection
             if 0 < column < columns - 1 and 0 < row < rows - 1:
                 left, right = other[row, column - 1], other[row, column + 1]
                 top, bottom = other[row - 1, column], other[row + 1, column]
                 across, down = 0.5 * (right - left), 0.5 * (bottom - top)
-                limit = 0.05 * other_depth
+                limit = 0.05 * other_inverse
                 if left > 0 and right > 0 and abs(across) < limit:
-                    other_depth += across * (u - column)
+                    other_inverse += across * (u - column)
                 if top > 0 and bottom > 0 and abs(down) < limit:
-                    other_depth += down * (v - row)
-            qz = g[2, 0] * u + g[2, 1] * v + g[2, 2] + c[2] * other_depth
+                    other_inverse += down * (v - row)
+            qz = g[2, 0] * u + g[2, 1] * v + g[2, 2] + c[2] * other_inverse
             if qz <= 1e-9:
                 continue
-            back_x = (g[0, 0] * u + g[0, 1] * v + g[0, 2] + c[0] * other_depth) / qz
-            back_y = (g[1, 0] * u + g[1, 1] * v + g[1, 2] + c[1] * other_depth) / qz
-            # depth in this view: q = K (R p z' + t), its third coordinate over 1 / z'
-            depth = qz / other_depth
+            back_x = (g[0, 0] * u + g[0, 1] * v + g[0, 2] + c[0] * other_inverse) / qz
+            back_y = (g[1, 0] * u + g[1, 1] * v + g[1, 2] + c[1] * other_inverse) / qz
+            # q is K (R p z' + t) / z', with z' the depth in the other view
+            depth = qz / other_inverse
             if (back_x - x) ** 2 + (back_y - y) ** 2 > max_px * max_px:
                 continue
             if abs(depth * w - 1.0) <= max_share:

@@ -59,7 +59,7 @@ def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
 
 @compiled_loop
 def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline):
-    """Return a window's ZNCC with one source image, or -2 if it is outside or untextured there.
+    """Return a window's ZNCC with a source image; -2 if mostly outside or without texture there.
 
     ``infinity`` (3, 3) is the homography of the plane at infinity, ``baseline`` (3,) the projected
     translation. The homography of ``plane`` is linearised at the window's centre.
@@ -131,7 +131,7 @@ def _window(reference, reach, y, x, tone, values, weights):
     """Fill ``values`` and bilateral ``weights`` of a window; return False if it has no texture.
 
     Values have weighted mean 0 and standard deviation 1. ``tone`` is the scale of the brightness
-    differences.
+    differences in the weights.
     """
     height, width = reference.shape
     centre = reference[y, x]
@@ -181,9 +181,9 @@ def refine_planes(
 
     Passes alternate in direction (Bleyer et al., BMVC 2011). The candidates of a pixel are the
     planes of its two neighbours visited before, and three random perturbations of its plane: of
-    depth, of slope, and of both by half as much. Pass 0 also computes the initial costs. ``step``
-    is the change of inverse depth that moves a projection by about a pixel; ``limits`` are the
-    smallest and largest inverse depth.
+    inverse depth, of slope, and of both by half as much. Pass 0 also computes the initial costs.
+    ``step`` is the largest perturbation of inverse depth in pass 0; it moves a projection by about
+    a pixel, and each pass halves it. ``limits`` are the smallest and largest inverse depth.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2
@@ -235,10 +235,11 @@ def plane_deviations(
 ):
     """Write the standard deviation of each pixel's inverse depth to ``out`` (H, W), 0 if unknown.
 
-    A window of N pixels has correlation rho with a source, gradient g, and moves by m per unit of
-    inverse depth along the epipolar line. The least-squares bound of the variance is
-    ``(1 - rho^2) Var / (N mean((g m)^2))``; it is averaged over the sources. Its root is multiplied
-    by ``calibration[1]``, and a matching error of ``calibration[0]`` pixels is added in quadrature.
+    A window of N pixels has brightness variance V, gradient g and correlation rho with a source; m
+    is its motion along the epipolar line per unit of inverse depth. The least-squares bound of the
+    variance is ``(1 - rho^2) V / (N mean((g m)^2))``, of which the harmonic mean is taken over the
+    sources with rho of at least 0.3. The square root of that mean is multiplied by
+    ``calibration[1]``, and a matching error of ``calibration[0]`` pixels is added in quadrature.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2

@@ -1,10 +1,10 @@
 """Depth by plane sweep, semi-global matching and slanted planes, or by COLMAP.
 
-Planes parallel to the reference (Collins, CVPR 1996; Gallup et al., CVPR 2007) are scored by the
-two best normalised cross-correlations, regularised by semi-global matching (Hirschmueller, PAMI
-2008) at half size, and refined by PatchMatch (Bleyer et al., BMVC 2011) at full size. A homogeneous
-pixel ``p`` of inverse depth ``w`` projects to ``infinity p + w baseline`` in a source, with
-``infinity = K_s R K^-1`` and ``baseline = K_s t``.
+Planes parallel to the image plane of the reference (Collins, CVPR 1996; Gallup et al., CVPR 2007)
+are scored by the two best normalised cross-correlations and regularised by semi-global matching
+(Hirschmueller, PAMI 2008) at half size; depth is then refined by PatchMatch with slanted planes
+(Bleyer et al., BMVC 2011) at full size. A homogeneous pixel ``p`` of inverse depth ``w`` projects
+to ``infinity p + w baseline`` in a source, with ``infinity = K_s R K^-1`` and ``baseline = K_s t``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Image = NDArray[np.float32]
 
 _BLOCK = 16
 _MIN_PLANES = 16
-_REACH = 3  # half the side of a window
+_REACH = 3  # pixels of a window on each side of its centre
 _TONE = 20.0  # difference from the centre's brightness (0 to 255) that has the weight 1/e
 # penalties for a step of one label and of more labels, and the contrast that halves the latter
 _P1, _P2, _EDGE = 8.0, 40.0, 20.0
@@ -76,7 +76,7 @@ class Sweep:
         size = reference.camera.width, reference.camera.height
         planes = tangent_planes(cv2.resize(inverse, size, interpolation=cv2.INTER_LINEAR))
         deviations = refine(reference, sources, planes, limits, 0.5 * step, self.options.passes)
-        # the true depth at the far limit may be larger, as that of the sky
+        # pixels at the far limit, such as those of the sky, may have a larger true depth
         deviations[planes[..., 0] <= limits[0] + 0.5 * step] = 0.0
         return as_estimate(reference.camera, planes, deviations)
 
@@ -151,7 +151,7 @@ def planes_of(camera: Camera, depth_m: NDArray[Any], normals: NDArray[Any]) -> F
     y, x = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
     covector = normals.astype(np.float64) @ np.linalg.inv(matrix)
     along = covector[..., 0] * x + covector[..., 1] * y + covector[..., 2]
-    # along is n X / z, and inverse depth 1 / z at the pixel
+    # along is n X / z at the pixel; the plane n X = d has the inverse depth n K^-1 p / d
     with np.errstate(divide="ignore", invalid="ignore"):
         slopes = covector[..., :2] / (along * depth_m)[..., None]
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
@@ -179,7 +179,10 @@ def _halved(view: StereoView) -> StereoView:
 def sweep(
     reference: StereoView, sources: Sequence[StereoView], limits: Floats, max_planes: int
 ) -> tuple[Image, float]:
-    """Return inverse depth float32 (H, W) and the step between planes; limits are (far, near)."""
+    """Return inverse depth float32 (H, W) and the step between planes.
+
+    ``limits`` are the smallest and the largest inverse depth.
+    """
     projections = [relative_projection(reference, source) for source in sources]
     step = pixel_step(projections, reference.camera, limits)
     wanted = int(np.ceil((limits[1] - limits[0]) / step)) + 1

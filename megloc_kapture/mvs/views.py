@@ -22,13 +22,13 @@ from megloc_kapture.values import Camera, RigidTransform
 Floats = NDArray[np.float64]
 Projections = Sequence[tuple[Floats, Floats]]
 
-# best triangulation angles: below, depth is uncertain; above, surfaces look different (after
+# best triangulation angles: below these, depth is uncertain; above, surfaces look different (after
 # Schoenberger et al., ECCV 2016, section 4.1, and MVSNet)
 _BEST_ANGLES_DEG = (5.0, 20.0)
 _WIDENED = (0.8, 1.25)
-_MIN_REGION_PX = 40  # smaller islands are chance agreements
+_MIN_REGION_PX = 40  # in smaller islands, views agree by chance
 # number of other views that must confirm a pixel; with 2, a tenth of the pixels are lost, and the
-# share of depths within 2 cm rises by only one percent
+# share of depths with an error below 2 cm rises by only one percent
 _MIN_VIEWS = 1
 # largest relative standard deviation of depth; surfaces without texture exceed it
 _MAX_RELATIVE_SIGMA = 0.03
@@ -47,7 +47,7 @@ def pinhole_matrix(camera: Camera) -> Floats:
 
 
 def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floats, Floats]:
-    """Return ``infinity`` (3, 3) and ``baseline`` (3,) of :mod:`megloc_kapture.mvs.sweep`."""
+    """Return ``infinity`` (3, 3) and ``baseline`` (3,), see :mod:`megloc_kapture.mvs.sweep`."""
     source_from_reference = source.cam_from_world @ reference.cam_from_world.inverse()
     k, k_source = pinhole_matrix(reference.camera), pinhole_matrix(source.camera)
     infinity = k_source @ source_from_reference.rotation_matrix() @ np.linalg.inv(k)
@@ -55,7 +55,11 @@ def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floa
 
 
 def pixel_step(projections: Projections, camera: Camera, limits: Floats) -> float:
-    """Return the inverse depth step that moves a pixel by one in the most sensitive source."""
+    """Return the inverse depth step of about one pixel in the most sensitive source.
+
+    The pixels per step are averaged between the ``limits`` of inverse depth; the median over the
+    image counts.
+    """
     x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * n for n in (camera.width, camera.height)))
     pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
     steps = np.linspace(limits[0], limits[1], 17)[:, None]
@@ -86,7 +90,7 @@ def stereo_view(
         if mask is not None:
             mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         return StereoView(small, pinhole, cam_from_world, mask)
-    # reduced first, against aliasing
+    # reduce first, to avoid aliasing
     lens = reduced_camera(camera, max(size))
     x, y = _undistortion(lens, pinhole)
     reduced = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
@@ -99,7 +103,7 @@ def stereo_view(
 
 
 def _undistortion(lens: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], ...]:
-    """Return distorted array coordinates x and y, float32 (H, W), of a pinhole's pixels."""
+    """Return array coordinates x and y, float32 (H, W), in the lens image of a pinhole's pixels."""
     fx, fy, cx, cy = pinhole.params
     u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     rays = np.stack([(u.ravel() - cx) / fx, (v.ravel() - cy) / fy, np.ones(u.size)], axis=1)
@@ -118,9 +122,10 @@ def choose_sources(
 ) -> list[int]:
     """Choose at most ``count`` sources for an image, best first, by shared points and angles.
 
-    A shared point has weight 1 at 5 to 20 degrees, decreasing with the squared ratio outside.
-    ``points_of``: rows of ``xyz`` per image; ``images_of``: first observation of each point (N +
-    1,), and the images (O,) in that order.
+    A shared point has weight 1 at 5 to 20 degrees, else the squared ratio of its angle to 5 degrees
+    or of 20 degrees to its angle. ``points_of``: rows of ``xyz`` per image; ``images_of``: index of
+    each point's first observation (N + 1,), and the images (O,) of the observations, sorted by
+    point.
     """
     starts, images = images_of
     points = points_of[image]
@@ -169,7 +174,7 @@ def agreeing_views(
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
     agreement: Agreement,
 ) -> NDArray[np.uint8]:
-    """Count other views (H, W) whose depth agrees in both directions."""
+    """Count the other views (H, W) whose depth agrees when projected there and back."""
     from megloc_kapture.mvs.kernels import count_agreeing
 
     counts = np.zeros(depth_m.shape, np.uint8)
@@ -188,10 +193,13 @@ def with_pose_errors(
     depth_range_m: tuple[float, float],
     error_px: float,
 ) -> DepthEstimate:
-    """Add the effect of pose errors, ``error_px`` along an axis, to an estimate's deviations."""
+    """Add the effect of pose errors to an estimate's deviations.
+
+    ``error_px`` is the standard deviation by which they move projections along an axis.
+    """
     limits = 1.0 / np.array(depth_range_m)[::-1]
     paths = [relative_projection(view, source) for source in sources]
-    # any of the sources may have decided
+    # average over the sources, since any of them may have determined the depth
     step = np.sqrt(np.mean([pixel_step([path], view.camera, limits) ** 2 for path in paths]))
     pose_sigma = (error_px * step * np.square(estimate.depth_m.astype(np.float64))).astype(
         np.float32

@@ -1,13 +1,14 @@
 """DELG's global branch (Cao et al., ECCV 2020): a ResNet, GeM pooling and a linear layer.
 
-Its ResNet has two forms in TensorFlow; convolutions with bias identify the first::
+The ResNet has two forms in TensorFlow; a checkpoint has the form "keras" if its convolutions have
+a bias::
 
-    keras   the authors' training code: strides on the first 1x1 convolution of a stage and its
-            shortcut, bias, epsilon 1e-3, padding SAME, a maximum pooling without padding (VALID)
-    slim    TF-Slim's resnet_v1: strides on the 3x3 convolution of a stage's last block except in
-            the last stage, no bias, epsilon 1e-5, padding by half a kernel, pooling SAME
+    keras   the authors' training code: stride 2 on the first 1x1 convolution of stages 2 to 4 and
+            on its shortcut, bias, epsilon 1e-3, padding SAME, max pooling without padding (VALID)
+    slim    TF-Slim's resnet_v1: stride 2 on the 3x3 convolution of the last block of stages 1 to
+            3, no bias, epsilon 1e-5, padding by half a kernel, max pooling with padding SAME
 
-Both have stride 32 and 2048 channels. The keys are torchvision's, see
+Both have an output stride of 32 and 2048 channels. The keys are torchvision's, see
 ``scripts/convert_weights.py``.
 """
 
@@ -37,7 +38,7 @@ from megloc_kapture.nets.trunks import (
 
 Form = Literal["keras", "slim"]
 DESCRIPTOR_SIZE = 2048
-_POWER = 3.0  # fixed in section 3.2 of the paper
+_POWER = 3.0  # of GeM pooling, fixed in section 3.2 of the paper
 _EPSILONS: dict[Form, float] = {"keras": 1e-3, "slim": 1e-5}
 _LEAST_PX = 5  # smaller sides vanish in the unpadded pooling
 
@@ -77,14 +78,14 @@ class DelgNet(nn.Module):
             x = functional.conv2d(image, weight, bias, 2, padding=3)
         x = functional.relu(self.bn1(x), inplace=True)
         if self.form == "slim":
-            # SAME: one column or row less on the left and at the top of an even side
+            # SAME: an even side is not padded on the left or at the top
             height, width = x.shape[-2:]
             x = functional.pad(x, (width % 2, 1, height % 2, 1))  # 0 is the minimum after a ReLU
         return functional.max_pool2d(x, 3, stride=2)
 
 
 def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torch.Tensor:
-    """Return the normalised sum of the vectors of several scales (section 4.1): float32 (B, 2048).
+    """Sum the unit-norm vectors of several scales and normalise (section 4.1): float32 (B, 2048).
 
     ``image`` is RGB (B, 3, H, W) in [0, 255], resized bilinearly without antialiasing; sides are
     rounded half to even.

@@ -1,9 +1,10 @@
 """Global descriptors with convolutional backbones: NetVLAD, OpenIBL and AP-GeM.
 
-NetVLAD (Arandjelovic et al., CVPR 2016) and OpenIBL (Ge et al., ECCV 2020) share a network on
-VGG-16 with whitening; the order of the whitening's inputs and the mean colour differ. AP-GeM
-(Revaud et al., ICCV 2019) is a ResNet with generalized-mean pooling and a linear layer. Parameters
-have the names of the authors' checkpoints, with additions by ``scripts/convert_weights.py``.
+NetVLAD (Arandjelovic et al., CVPR 2016) and OpenIBL (Ge et al., ECCV 2020) share a network: VGG-16,
+NetVLAD's layer and whitening; the order of the whitening's inputs and the mean colour differ.
+AP-GeM (Revaud et al., ICCV 2019) is a ResNet with generalized-mean pooling and a linear layer.
+Parameters have the names of the authors' checkpoints, with additions by
+``scripts/convert_weights.py``.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ STRIDE_PX = 16  # stride of the backbone, which is also the smallest image side
 _CONV5_3 = 28  # the last layer, without its ReLU: features have either sign
 _CHANNELS = 512
 _NUM_CLUSTERS, _OUTPUT_SIZE = 64, 4096
-# only the converted files of NetVLAD's authors have this key
+# only checkpoints converted from NetVLAD's authors have this key
 _AVERAGE_IMAGE = "average_image"
 # OpenIBL's mean for colours in [0, 1], times 255
 _OPENIBL_MEAN_RGB = (123.68, 116.779, 103.939)
@@ -50,8 +51,8 @@ class NetVladLayer(nn.Module):
 
         V(d, k) = sum_i a_k(x_i) (x_i(d) - c_k(d)),   a_k(x) = exp(w_k . x) / sum_k' exp(w_k' . x)
 
-    Each cluster is normalised, then the whole vector. In ``order`` "dk" the cluster index runs
-    fastest, as in the authors' MATLAB code; in "kd" the channel index, as in OpenIBL.
+    Each cluster's vector is normalised, then the whole vector. In ``order`` "dk" the cluster index
+    runs fastest, as in the authors' MATLAB code; in "kd" the channel index does, as in OpenIBL.
     """
 
     def __init__(self, num_clusters: int, size: int, *, order: Order) -> None:
@@ -64,7 +65,7 @@ class NetVladLayer(nn.Module):
         """Aggregate non-zero features (B, D, h, w) to unit-norm vectors (B, K D)."""
         unit = functional.normalize(features, dim=1)
         weights = self.conv(unit).flatten(2).softmax(dim=1)
-        # avoids the (B, K, D, h w) array of residuals
+        # sum first, which avoids the (B, K, D, h w) array of residuals
         sums = weights @ unit.flatten(2).mT
         residuals = sums - weights.sum(dim=2)[:, :, None] * self.centroids
         residuals = functional.normalize(residuals, dim=2)
@@ -111,8 +112,8 @@ class VggNetVlad(nn.Module):
 def netvlad(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
     if _AVERAGE_IMAGE not in tensors:
         raise DataError(
-            f"not the weights of NetVLAD's authors: it lacks {_AVERAGE_IMAGE} (OpenIBL's are for "
-            "the plugin openibl)",
+            f"not the weights of NetVLAD's authors: the file lacks {_AVERAGE_IMAGE} (OpenIBL's "
+            "weights are for the plugin openibl)",
             path=where,
         )
     rest = dict(tensors)
@@ -126,7 +127,7 @@ def netvlad(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
 def openibl(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
     if _AVERAGE_IMAGE in tensors:
         raise DataError(
-            "weights of NetVLAD's authors, which are for the plugin netvlad, not OpenIBL's",
+            "these are the weights of NetVLAD's authors, for the plugin netvlad, not OpenIBL's",
             path=where,
         )
     return _filled(tensors, where, "kd", _OPENIBL_MEAN_RGB)
@@ -138,7 +139,7 @@ def _filled(
     order: Order,
     mean_rgb: tuple[float, float, float],
 ) -> VggNetVlad:
-    # no random initialisation of half a gigabyte
+    # skip the random initialisation of half a gigabyte
     with torch.device("meta"):
         module = VggNetVlad(
             order=order,
@@ -201,8 +202,8 @@ class ApGemNet(ResNet):
 class Whitening(nn.Module):
     """PCA whitening by a power of the variance, then normalisation.
 
-    ``power`` is 0.5 in scikit-learn, 0.25 in the authors' evaluation; 0 does not whiten. The PCA
-    has ``mean`` (D,), ``components`` (K, D) and ``variance`` (K,).
+    ``power`` is 0.5 in scikit-learn and 0.25 in the authors' evaluation; 0 means PCA without
+    whitening. The PCA has ``mean`` (D,), ``components`` (K, D) and ``variance`` (K,).
     """
 
     mean: torch.Tensor

@@ -1,6 +1,7 @@
 """Networks of kornia with local weight files: XFeat, DISK, LightGlue and LighterGlue.
 
-kornia's ``from_pretrained`` downloads, so each module is built without weights and loaded strictly.
+kornia's ``from_pretrained`` downloads weights. Instead, each module is built without weights and
+loaded strictly from a local file.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ Tensors = Mapping[str, torch.Tensor]
 _BLOCK = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")
 # keys of DISK's LightGlue that the published code does not read
 _UNUSED = re.compile(r"^log_assignment\.\d+\.r$")
-# the authors' file of LighterGlue also contains its XFeat
+# the authors' file of LighterGlue also contains XFeat's weights
 _MATCHER, _EXTRACTOR = "matcher.", "extractor.model.net."
 _building = Lock()
 
@@ -81,9 +82,9 @@ def load_lightglue(
 ) -> nn.Module:
     """Build LightGlue (Lindenberger et al., ICCV 2023) from one of the authors' files.
 
-    By default it stops early (``depth_confidence``) and drops keypoints (``width_confidence``), as
-    the authors do. Tensors for these may be missing if they are off (-1). Positions and assignment
-    are never in half precision.
+    By default the network stops early (``depth_confidence``) and drops keypoints
+    (``width_confidence``), as the authors' does. With -1, which disables these, the tensors that
+    only they need may be missing. Positional encoding and assignment are never in half precision.
     """
     tensors = {
         _BLOCK.sub(r"transformers.\2.\1.", key): value
@@ -128,7 +129,7 @@ def load_lightglue(
 def _cross_attention(
     block: Any, x0: torch.Tensor, x1: torch.Tensor, mask: None = None
 ) -> tuple[torch.Tensor, ...]:
-    """Compute kornia's cross-attention without (heads, N, M) matrices, in a fifth less time."""
+    """Compute kornia's cross-attention without (heads, N, M) matrices, in 20 % less time."""
     (query0, value0), (query1, value1) = (
         [
             project(x).unflatten(-1, (block.heads, -1)).transpose(1, 2)

@@ -73,7 +73,7 @@ SMALLEST_PX = 64  # smallest side that leaves enough cells after AlexNet's pooli
 class _Head(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
-        # in the published heads, number 0 is a dropout
+        # in the published heads, layer 0 is a dropout
         self.model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -83,8 +83,8 @@ class _Head(nn.Module):
 class Lpips(nn.Module):
     """LPIPS with one of the three published trunks.
 
-    Parameters have torchvision's names ``features.*`` and the published ``lin{k}.model.1.weight``;
-    the latter are the squares of the weights in equation 1 of the paper.
+    Parameters have torchvision's names ``features.*`` and the published names
+    ``lin{k}.model.1.weight``; the latter are the squares of the weights in equation 1 of the paper.
     """
 
     def __init__(self, trunk: Trunk) -> None:
@@ -105,7 +105,7 @@ class Lpips(nn.Module):
 
     def described(self, image: torch.Tensor, valid: torch.Tensor) -> list[torch.Tensor]:
         """Return each layer's unit-norm features (B, C, h, w); see :meth:`forward`."""
-        # channels last gives the same features, faster on a CPU
+        # on a CPU, channels last is faster, with the same features
         x = in_fast_layout(self._normalised(image) * valid)
         normalised = []
         for number, layer in enumerate(self.features):

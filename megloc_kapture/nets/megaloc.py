@@ -1,9 +1,9 @@
 """MegaLoc (Berton and Masone, CVPR Workshops 2025): DINOv2 ViT-B/14, SALAD, a linear layer.
 
-Parameters are named as in ``model.safetensors``; the older ``megaloc.torch``, with
-``backbone.model`` and ``mask_token``, is accepted too. DINOv2 (Oquab et al., TMLR 2024) has no
-registers. SALAD (Izquierdo and Civera, CVPR 2024) assigns patches to clusters and a dustbin by
-optimal transport.
+Parameters are named as in the authors' ``model.safetensors``; the older ``megaloc.torch``, with the
+keys ``backbone.model.*`` and a ``mask_token``, is accepted too. DINOv2 (Oquab et al., TMLR 2024) is
+the variant without registers. SALAD (Izquierdo and Civera, CVPR 2024) assigns patches to clusters
+and a dustbin by optimal transport.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.nets.trunks import imagenet_normalised
 
 _OLDER_TRUNK = "backbone.model."
-_ITERATIONS = 3  # as in training
+_ITERATIONS = 3  # of Sinkhorn's algorithm, as in training
 PATCH_PX = 14
 
 _EPSILON = 1e-6
@@ -80,7 +80,7 @@ def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
 class Salad(nn.Module):
     """SALAD: aggregates features of patches and of the image to one unit-norm vector.
 
-    The input has ``channels``, the projections have ``hidden`` channels, and the output has
+    The input has ``channels`` channels, the hidden layers have ``hidden``, and the output has
     ``token_size + cluster_size * clusters`` components.
     """
 
@@ -104,7 +104,7 @@ class Salad(nn.Module):
     def forward(self, patches: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
         """Aggregate features of patches (B, C, h, w) and image (B, C) to float32 (B, D)."""
         features = self.cluster_features(patches).flatten(2)
-        # half precision would leave two digits after the exponential
+        # in half precision only two digits would be correct after the exponential
         shares = assignment(self.score(patches).flatten(2).float(), self.dust_bin)
         summed = torch.matmul(features, shares.to(features).mT).float()
         summed = functional.normalize(summed, dim=1)
@@ -113,10 +113,10 @@ class Salad(nn.Module):
 
 
 def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
-    """Assign N patches to K clusters by scores (B, K, N); return the shares (B, K, N).
+    """Assign N patches to K clusters by scores (B, K, N); return the weights (B, K, N).
 
-    It runs three Sinkhorn iterations in the log domain. Patches and clusters have mass 1; the
-    dustbin, with score ``dust_bin`` (), takes the rest.
+    It runs three Sinkhorn iterations in the log domain. Each patch and each cluster has mass 1; the
+    dustbin, with score ``dust_bin`` (), takes the rest of the patches' mass.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:
@@ -136,7 +136,7 @@ def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
 def _per_patch(channels: int, hidden: int, out: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(channels, hidden, 1),
-        nn.Identity(),  # takes the place of a dropout, so that the keys fit
+        nn.Identity(),  # in place of a dropout, so that the keys are those of the checkpoint
         nn.ReLU(),
         nn.Conv2d(hidden, out, 1),
     )
@@ -179,8 +179,8 @@ class DinoV2(nn.Module):
         """Return position embeddings, (1, 1 + rows * columns, C).
 
         They are interpolated bicubically without antialiasing. The scale is ``(rows + 0.1) / grid``
-        as in DINOv2, not ``rows / grid`` as in transformers; for 23 patches and a grid of 37, these
-        differ by up to 0.16 grid positions.
+        as in DINOv2, not ``rows / grid`` as in Hugging Face's transformers; for 23 rows and a grid
+        of 37, the sampled positions differ by up to 0.16 grid cells.
         """
         if rows == columns == self.grid:
             return self.pos_embed

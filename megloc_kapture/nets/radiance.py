@@ -1,9 +1,10 @@
-"""Radiance fields: rays to colour, depth, opacity and uncertainty.
+"""Radiance fields, which render the colour, depth, opacity and uncertainty of rays.
 
 Volume rendering follows NeRF (Mildenhall et al., ECCV 2020, eq. 3); the transient part and the loss
 follow NeRF-W (Martin-Brualla et al., CVPR 2021, eqs. 8 to 13). Rays are ``origin + t direction``;
-directions have z = 1 in the camera, so t is depth along the optical axis. :class:`NerfW` has the
-keys of kwea123/nerf_pl's branch ``nerfw``; :class:`TriPlane` is small enough to train on a CPU.
+directions are scaled such that t is the depth along the optical axis in the map's unit.
+:class:`NerfW` has the keys of kwea123/nerf_pl's branch ``nerfw``; :class:`TriPlane` is small enough
+to train on a CPU.
 """
 
 from __future__ import annotations
@@ -22,32 +23,33 @@ _LAYERS, _WIDTH, _SKIP = 8, 256, 4
 _NERF_POINT_FREQUENCIES, _NERF_DIRECTION_FREQUENCIES = 10, 4
 _NERF_APPEARANCE, _NERF_TRANSIENT = 48, 16
 _COARSE, _FINE = 64, 64
-# tri-planes: sides and channels, then as above
+# tri-planes: sides and channels of the planes; geometry features and width of the hidden layers;
+# frequencies of points and directions; embedding sizes
 _RESOLUTIONS, _CHANNELS = (64, 128, 256), 12
 _GEOMETRY, _HIDDEN = 15, 64
 _POINT_FREQUENCIES, _DIRECTION_FREQUENCIES = 3, 2
 _APPEARANCE, _TRANSIENT = 8, 16
-# samples per ray: density search in training, and in rendering, where surfaces are thin; even
-# samples; importance samples
-_LOOKING, _CLOSELY, _SPREAD, _THERE = 32, 96, 8, 16
-_REACH = 1.25  # contracted coordinates end here; up to 1 they are not contracted
+# samples per ray: of the density pass in training, and in rendering, where more are needed because
+# trained surfaces are thin; samples over the whole ray; samples near the surface
+_TRAINING_PASS, _RENDERING_PASS, _WHOLE_RAY, _NEAR_SURFACE = 32, 96, 8, 16
+_REACH = 1.25  # bound of the contracted coordinates; coordinates up to 1 are not contracted
 _MAX_LOG_DENSITY = 12.0
 _AXES = ((0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    # origins, directions: float32 (N, 3), in field units
+    # origins, directions: float32 (N, 3), in the field's frame; directions per unit of t
     origins: torch.Tensor
     directions: torch.Tensor
     # near, far: t of a ray's ends
     near: float
     far: float
-    # appearance, transient: image embeddings (N, A) and (N, T); None means the mean appearance, and
-    # no transients
+    # appearance, transient: image embeddings (N, A) and (N, T); without them, rays have the mean
+    # appearance and no transient part
     appearance: torch.Tensor | None = None
     transient: torch.Tensor | None = None
-    # float32 (N,), t of the known surface, around which samples are drawn; 0 where unknown
+    # float32 (N,): t of the surface, around which samples are drawn; 0 where unknown
     depth: torch.Tensor | None = None
 
     def points(self, t: torch.Tensor) -> torch.Tensor:
@@ -61,11 +63,11 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    # sigma, rgb: static density (N, S), and colour (N, S, 3) in [0, 1]
+    # sigma, rgb: density (N, S) and colour (N, S, 3), in [0, 1], of the static part
     sigma: torch.Tensor
     rgb: torch.Tensor
-    # transient_sigma, transient_rgb, transient_beta: density, colour and uncertainty (N, S) of the
-    # transient part, or None
+    # transient_sigma, transient_rgb, transient_beta: density (N, S), colour (N, S, 3) and
+    # uncertainty (N, S) of the transient part, or None
     transient_sigma: torch.Tensor | None = None
     transient_rgb: torch.Tensor | None = None
     transient_beta: torch.Tensor | None = None
@@ -76,17 +78,17 @@ class Rendered:
     rgb: torch.Tensor  # (N, 3) in [0, 1]; black where empty
     depth: torch.Tensor  # (N,), mean t; 0 where empty
     opacity: torch.Tensor  # (N,), share of the light that the ray's samples absorb
-    # (N,), standard deviation of the colour by NeRF-W's transient part, or the minimum
+    # (N,), NeRF-W's standard deviation of the colour; its minimum without a transient part
     beta: torch.Tensor
-    weights: torch.Tensor  # (N, S), share of each sample
-    transient_density: torch.Tensor  # mean over all samples; 0 without transients
+    weights: torch.Tensor  # (N, S), share of the light that each sample absorbs
+    transient_density: torch.Tensor  # (), mean over all samples; 0 without a transient part
     coarse_rgb: torch.Tensor | None = None
 
 
 def composite(t: torch.Tensor, deltas: torch.Tensor, samples: Samples) -> Rendered:
     """Composite samples along rays: NeRF's eq. 3, or with a transient part NeRF-W's eqs. 8 to 10.
 
-    ``t`` (N, S) is ascending; ``deltas`` (N, S) are lengths of ray pieces, in the unit of
+    ``t`` (N, S) is ascending; ``deltas`` (N, S) are the lengths of the ray segments, in the unit of
     1/density.
     """
     total = samples.sigma
@@ -118,7 +120,7 @@ def spacings(t: torch.Tensor, rays: Rays) -> torch.Tensor:
 
 
 def stratified(rays: Rays, count: int, generator: torch.Generator | None) -> torch.Tensor:
-    """Sample one t (N, count) in each of ``count`` intervals of a ray, which grow with t."""
+    """Sample one t in each of ``count`` intervals of a ray, which grow with t: (N, count)."""
     number = len(rays.origins)
     shares = torch.arange(count, device=rays.origins.device, dtype=rays.origins.dtype)
     within = _uniform((number, count), generator, rays.origins)
@@ -145,7 +147,7 @@ def importance(
 def about_depth(
     depth: torch.Tensor, instead: torch.Tensor, generator: torch.Generator | None
 ) -> torch.Tensor:
-    """Return even samples (N, S) around known depths (N,); elsewhere return ``instead`` (N, S)."""
+    """Return stratified samples (N, S) around depths (N,), and ``instead`` where they are 0."""
     count = instead.shape[1]
     drawn = torch.arange(count, device=depth.device, dtype=depth.dtype)
     drawn = (drawn + _uniform(tuple(instead.shape), generator, depth)) / count
@@ -163,7 +165,10 @@ def _uniform(
 
 
 def frequencies(values: torch.Tensor, count: int) -> torch.Tensor:
-    """Encode (..., 3) by position: NeRF's eq. 4 in nerf_pl's order, (..., 3 + 6 count)."""
+    """Apply the positional encoding to values (..., 3): (..., 3 + 6 count).
+
+    It is NeRF's eq. 4 as in nerf_pl: without the factor pi, and preceded by the values.
+    """
     parts = [values]
     for power in range(count):
         parts += [torch.sin(2.0**power * values), torch.cos(2.0**power * values)]
@@ -171,7 +176,7 @@ def frequencies(values: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def nerf_w_loss(rendered: Rendered, rgb: torch.Tensor) -> torch.Tensor:
-    """Compute NeRF-W's loss (eq. 13) with the public code's constants; rgb (N, 3) is observed."""
+    """Compute NeRF-W's loss (eq. 13) for observed colours (N, 3), with nerf_pl's constants."""
     squared = torch.square(rendered.rgb - rgb).mean(1)
     loss = (squared / (2 * torch.square(rendered.beta))).mean() + torch.log(rendered.beta).mean()
     loss = loss + 3.0 + 0.01 * rendered.transient_density
@@ -181,7 +186,7 @@ def nerf_w_loss(rendered: Rendered, rgb: torch.Tensor) -> torch.Tensor:
 
 
 class NerfMlp(nn.Module):
-    """One of NeRF-W's two networks: eight layers, a colour head and a transient head."""
+    """One of NeRF-W's two networks: eight layers, a colour head and an optional transient head."""
 
     def __init__(self, appearance_size: int = 0, transient_size: int = 0) -> None:
         super().__init__()
@@ -237,9 +242,10 @@ class NerfMlp(nn.Module):
 class NerfW(nn.Module):
     """NeRF-W's coarse and fine network, and the embeddings of the images.
 
-    nerf_pl's keys: ``nerf_coarse.*``, ``nerf_fine.*``, ``embedding_a.weight`` and
-    ``embedding_t.weight``. Only the fine network has appearance and transients. ``num_images`` and
-    ``num_lights`` are rows of the transient and the appearance embedding, equal by default.
+    The keys are nerf_pl's: ``nerf_coarse.*``, ``nerf_fine.*``, ``embedding_a.weight`` and
+    ``embedding_t.weight``. Only the fine network depends on appearance and has a transient part.
+    ``num_images`` and ``num_lights`` are the numbers of rows of the transient and of the appearance
+    embedding, equal by default.
     """
 
     def __init__(self, num_images: int, num_lights: int | None = None) -> None:
@@ -258,7 +264,7 @@ class NerfW(nn.Module):
         return self.embedding_t
 
     def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """Render rays; samples are random with a generator, else evenly spaced."""
+        """Render rays; samples are random with a generator, else fixed."""
         unit = nn.functional.normalize(rays.directions, dim=1)
         t = stratified(rays, _COARSE, generator)
         coarse = composite(t, spacings(t, rays), self.nerf_coarse(rays.points(t), unit))
@@ -273,9 +279,10 @@ class TriPlane(nn.Module):
     """Three planes at three resolutions, and the embeddings of the images.
 
     A point's features are products of three planes (K-Planes, Fridovich-Keil et al., CVPR 2023, eq.
-    1); small networks turn them into density, colour and transients. Samples lie around the known
-    depth, or a density pass places them. Space beyond -1 to 1 is contracted. For ``num_images`` and
-    ``num_lights`` see :class:`NerfW`; ``unconstrained`` models varying light and moving objects.
+    1); small networks turn them into density, colour and a transient part. Most samples lie around
+    the known depth or, if it is unknown, around the surface that a first pass finds. Coordinates
+    beyond -1 and 1 are contracted. For ``num_images`` and ``num_lights`` see :class:`NerfW`;
+    ``unconstrained`` models varying light and moving objects.
     """
 
     def __init__(
@@ -336,19 +343,20 @@ class TriPlane(nn.Module):
     @torch.no_grad()
     def _where(self, rays: Rays, generator: torch.Generator | None) -> torch.Tensor:
         depth = rays.depth
-        spread = stratified(rays, _SPREAD, generator)
-        near_surface = spread.new_zeros(len(spread), _THERE)
+        spread = stratified(rays, _WHOLE_RAY, generator)
+        near_surface = spread.new_zeros(len(spread), _NEAR_SURFACE)
         unknown = torch.arange(len(spread), device=spread.device)
         if depth is not None:
             near_surface = about_depth(depth, near_surface, generator)
             unknown = torch.nonzero(depth <= 0)[:, 0]
         if len(unknown):
             some = Rays(rays.origins[unknown], rays.directions[unknown], rays.near, rays.far)
-            t = stratified(some, _LOOKING if generator else _CLOSELY, generator)
+            t = stratified(some, _TRAINING_PASS if generator else _RENDERING_PASS, generator)
             sigma = self.density(some.points(t))[0]
             passed = torch.cumsum(sigma * spacings(t, some), dim=1)
             left = torch.exp(-torch.cat([torch.zeros_like(passed[:, :1]), passed], dim=1))
-            near_surface[unknown] = importance(t, left[:, :-1] - left[:, 1:], _THERE, generator)
+            weights = left[:, :-1] - left[:, 1:]
+            near_surface[unknown] = importance(t, weights, _NEAR_SURFACE, generator)
         return torch.sort(torch.cat([spread, near_surface], dim=1), dim=1).values
 
 
@@ -361,7 +369,7 @@ def _repeated(values: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def _contracted(points: torch.Tensor) -> torch.Tensor:
-    """Contract coordinates beyond 1 smoothly (as mip-NeRF 360, eq. 10)."""
+    """Contract coordinates beyond 1 smoothly (as in mip-NeRF 360, eq. 10)."""
     size = points.abs()
     margin = _REACH - 1.0
     outside = _REACH - margin**2 / (size.clamp_min(1.0) - 1.0 + margin)

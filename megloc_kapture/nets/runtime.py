@@ -33,7 +33,7 @@ class NetworkOptions(Options):
     device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
     half_precision: bool = Field(
         default=False,
-        description="compute in float16 on a GPU, bfloat16 on a CPU, except for keypoints",
+        description="compute in float16 on a GPU, bfloat16 on a CPU, except for keypoint positions",
     )
 
 
@@ -52,12 +52,12 @@ def pick_device(device: Device) -> torch.device:
 
 @contextmanager
 def inference(device: torch.device, half_precision: bool = False) -> Iterator[None]:
-    """Disable gradients; half precision is float16 on a GPU, bfloat16 on a CPU, and never TF32."""
+    """Disable gradients and TF32; half precision is float16 on a GPU and bfloat16 on a CPU."""
     half = torch.float16 if device.type == "cuda" else torch.bfloat16
     autocast = torch.autocast(device.type, dtype=half, enabled=half_precision)
     if half_precision and device.type == "cpu":
         _warn_of_slow_half()
-    # TF32 is a setting of the process, so only one thread computes at a time
+    # TF32 is a setting of the whole process, so only one thread at a time computes on the GPU
     exclusive = _gpu_lock if device.type == "cuda" else nullcontext()
     with exclusive, without_tf32(device), torch.inference_mode(), autocast:
         yield
@@ -71,7 +71,7 @@ def _warn_of_slow_half() -> None:
 
 @contextmanager
 def without_tf32(device: torch.device) -> Iterator[None]:
-    """Compute float32 products and convolutions in full precision, in all threads."""
+    """Compute float32 matrix products and convolutions in full precision, in all threads."""
     if device.type == "cpu":
         yield
         return
@@ -79,7 +79,7 @@ def without_tf32(device: torch.device) -> Iterator[None]:
     convolutions: Any = torch.backends.cudnn
     name: str = "allow_tf32"
     exact: Any = False
-    if hasattr(products, "fp32_precision"):  # torch 2.9 refuses a mix with the older settings
+    if hasattr(products, "fp32_precision"):  # torch 2.9 rejects a mix with the older settings
         convolutions, name, exact = convolutions.conv, "fp32_precision", "ieee"
     settings = products, convolutions
     previous = [getattr(setting, name) for setting in settings]
@@ -99,7 +99,7 @@ def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor
 
 
 def in_fast_layout(batch: torch.Tensor) -> torch.Tensor:
-    """Return images (N, C, H, W) in the memory layout of networks with ``channels_last``."""
+    """Return images (N, C, H, W) in the layout of ``Checkpointed.network(channels_last=True)``."""
     on_cpu = batch.device.type == "cpu"
     return batch.contiguous(
         memory_format=torch.channels_last if on_cpu else torch.contiguous_format
@@ -111,8 +111,8 @@ def sized_tensor(
 ) -> torch.Tensor:
     """Convert an RGB image, uint8 (H, W, 3), to float32 (1, 3, h, w) in [0, 1], with a size limit.
 
-    Larger images are reduced by area averaging without rounding, as in hloc. Sides are rounded half
-    to even, to at least 1.
+    Larger images are reduced by area averaging without rounding of the values, as in hloc. Sides
+    are rounded half to even, and are at least 1.
     """
     height, width = image.shape[:2]
     if max_size_px is None or max(height, width) <= max_size_px:
@@ -124,7 +124,7 @@ def sized_tensor(
 
 
 def batch_counters(module: nn.Module) -> set[str]:
-    """Return keys of batch counters, absent from weights of ONNX and torch before 0.4.1."""
+    """Return the keys of batch counters, which weights from ONNX and torch before 0.4.1 lack."""
     return {key for key in module.state_dict() if key.endswith("num_batches_tracked")}
 
 
@@ -156,7 +156,7 @@ def load_strictly(
     if not any(getattr(tensor, "is_shared_file", False) for tensor in tensors.values()):
         module.load_state_dict(dict(tensors), strict=False)
         return module
-    # memory-mapped parameters, shared by all processes
+    # keep memory-mapped tensors as parameters, so that all processes share them
     parameters = {
         key: value
         if getattr(value, "is_shared_file", False) and value.dtype == expected[key].dtype
@@ -173,7 +173,7 @@ def first_few(keys: Sequence[str], count: int = 5) -> str:
 
 
 class Checkpointed(Generic[AnyOptions]):
-    """A plugin with a network; the option ``weights`` is a file name or path."""
+    """Base of plugins with a network; the option ``weights`` is a registered name or a path."""
 
     Options: ClassVar[Any]
 
@@ -199,9 +199,9 @@ class Checkpointed(Generic[AnyOptions]):
 
         Parameters
         ----------
-        load : builds the network from a checkpoint's tensors, its file name and the arguments.
-        file : replaces the option's checkpoint.
-        channels_last : layout of the weights on a CPU, where it is faster; see in_fast_layout.
+        load : builds the network from a checkpoint's tensors, its path and the arguments.
+        file : replaces the checkpoint of the option ``weights``.
+        channels_last : use this layout on a CPU, where it is faster; see :func:`in_fast_layout`.
         """
         wanted: Any = self.options
         device = pick_device(wanted.device)
@@ -238,7 +238,7 @@ def load_state(
         model.load_state_dict(content.pop("model"))
         optimizer.load_state_dict(content.pop("optimizer"))
         return {**content, "step": int(content["step"])}
-    except Exception as error:  # torch raises many kinds on damaged files
+    except Exception as error:  # torch raises many kinds of errors on damaged files
         raise DataError(
             "is damaged, or the state of another training; -f starts over", path=path
         ) from error

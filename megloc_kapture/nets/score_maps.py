@@ -7,8 +7,9 @@ bilinearly, zero outside::
 
     y(p) = sum_k w_k m_k(p) x(p + p_k + offset_k(p))
 
-``embedding_bag`` interpolates four rows of a pixel-by-channel table, and a matrix product applies
-the weights. On a CPU this is several times faster than ``grid_sample``.
+with weights w_k, amplitudes m_k and tap positions p_k. ``embedding_bag`` interpolates four rows of
+a pixel-by-channel table, and a matrix product applies w_k. On a CPU this is several times faster
+than ``grid_sample``.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ class SelectedPixels:
 def pixel_scores(logits: torch.Tensor) -> torch.Tensor:
     """Convert a detector's logits (B, 65, h, w) of 8 x 8 cells to scores (B, 8h, 8w).
 
-    As in SuperPoint and XFeat: channel c is pixel (c // 8, c % 8) of a cell, the last is "no
-    keypoint".
+    As in SuperPoint and XFeat, channel c is pixel (c // 8, c % 8) of a cell, and the last channel
+    is "no keypoint".
     """
     probabilities = functional.softmax(logits.float(), dim=1)
     return functional.pixel_shuffle(probabilities[:, :-1], CELL_PX)[:, 0]
@@ -52,7 +53,7 @@ def window_maximum(values: torch.Tensor, radius: int) -> torch.Tensor:
     for axis in (-1, -2):
         padding = [radius, radius] if axis == -1 else [0, 0, radius, radius]
         values = functional.pad(values, padding, value=lowest)
-        reach, side = 1, 2 * radius + 1  # each entry is the maximum of `reach` entries from it on
+        reach, side = 1, 2 * radius + 1  # an entry is the maximum of `reach` entries from it on
         while reach < side:
             step = min(reach, side - reach)
             length = values.shape[axis] - step
@@ -96,7 +97,7 @@ def select_pixels(
     ----------
     scores : (H, W), after non-maximum suppression.
     threshold : lower bound (exclusive).
-    border : columns and rows at each side of the map without candidates.
+    border : width of the map's border without candidates, in pixels.
     mask : bool (H or more, W or more), True = use, applied before the selection.
     max_keypoints : None keeps all.
     """
@@ -121,7 +122,7 @@ def soft_argmax(
 
     This is ALIKED's differentiable keypoint detection (Zhao et al., TIM 2023). ``scores`` are
     (H, W); ``xy`` int64 (N, 2) are columns and rows, at least ``radius`` from the border. Returns
-    (N, 2); pixel centres are integers.
+    positions (N, 2); the centre of the first pixel is (0, 0).
     """
     side = torch.arange(-radius, radius + 1, device=scores.device)
     steps = torch.cartesian_prod(side, side)
@@ -131,11 +132,11 @@ def soft_argmax(
 
 
 def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
-    """Find the paraboloid's peak around each pixel, at most half a pixel away per axis.
+    """Find the peak of a paraboloid fitted around each pixel, at most half a pixel away per axis.
 
     It takes one Newton step on the score map (H, W) with central differences (Lowe, IJCV 2004,
     section 4), or none if the Hessian is singular. ``xy`` int64 (N, 2) are columns and rows, not on
-    the border. Returns (N, 2); pixel centres are integers.
+    the border. Returns positions (N, 2); the centre of the first pixel is (0, 0).
     """
     x, y = xy.unbind(1)
     gradient_x = (scores[y, x + 1] - scores[y, x - 1]) / 2
@@ -180,20 +181,20 @@ def _second_differences(
 def corners_around(
     y: torch.Tensor, x: torch.Tensor, size: tuple[int, int], amplitude: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return flat indices and weights, (number of S, 4) each, for bilinear interpolation.
+    """Return flat indices and weights, (N, 4) each, for bilinear interpolation at N positions.
 
-    Indices are always within the map; weights are zero outside.
+    Indices are always within the map; pixels outside have weight zero.
 
     Parameters
     ----------
-    y, x : any shape S, rows and columns; a pixel's centre is an integer.
+    y, x : rows and columns, any shape with N elements; the centre of the first pixel is (0, 0).
     size : (H, W) of the map.
-    amplitude : shape S or None, a factor on the weights.
+    amplitude : factors on the weights, of the same shape, or None.
     """
     height, width = size
     top, left = torch.floor(y), torch.floor(x)
     below, right = y - top, x - left
-    # weights are zero beyond a pixel off the map; clamping prevents integer overflow
+    # clamping prevents integer overflow; weights are zero more than a pixel outside the map
     row = top.clamp(-2, height).long()
     column = left.clamp(-2, width).long()
     weights_y = [
@@ -235,7 +236,7 @@ def pixel_table(values: torch.Tensor) -> torch.Tensor:
 def conv_same(
     x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, stride: int
 ) -> torch.Tensor:
-    """Convolve with TensorFlow's SAME padding: at stride 2, even sides are padded at the end."""
+    """Convolve with TensorFlow's SAME padding, which at stride 2 is asymmetric for even sides."""
     margins: list[int] = []
     for size, kernel in zip(x.shape[:1:-1], weight.shape[:1:-1], strict=True):
         total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
@@ -257,7 +258,7 @@ def deform_conv2d(
 
     Parameters
     ----------
-    x : (B, C, H, W); fastest in channels-last memory, like the result.
+    x : (B, C, H, W); fastest in channels-last memory, which the result has.
     offset : (B, 18, H, W), pixels: (dy, dx) per tap, taps row by row.
     weight, bias : (D, C, 3, 3), and (D,) or None.
     mask : (B, 9, H, W) or None, amplitudes.

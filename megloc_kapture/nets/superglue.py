@@ -1,10 +1,11 @@
 """SuperGlue (Sarlin, DeTone, Malisiewicz and Rabinovich, CVPR 2020), with official parameter names.
 
 All keypoints of a batch are in one tensor without padding; only attention and transport separate
-the images. Optimal transport (section 3.2) is Sinkhorn's algorithm with log potentials and
-matrix-vector products of exp(Z + u + v), whose scales are absorbed before they grow (Schmitzer,
-"Stabilized sparse scaling algorithms", SIAM J. Sci. Comput. 2019, section 3.1). The first iteration
-is in the log domain; after it no product overflows, and omitted terms are less than 1e-7 of a sum.
+the images. Optimal transport (section 3.2) is Sinkhorn's algorithm: its scaling vectors multiply
+the matrix exp(Z + u + v) and are absorbed into the log potentials u and v before they grow
+(Schmitzer, "Stabilized sparse scaling algorithms", SIAM J. Sci. Comput. 2019, section 3.1). The
+first iteration is in the log domain; after it no product overflows, and the entries that are set to
+zero are less than 1e-7 of a sum.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from torch.nn import functional
 from megloc_kapture.nets.runtime import load_strictly
 
 _HEADS = 4
-_LARGEST_SCALE = 2.0e4  # larger scales, or those below its inverse, are absorbed into potentials
-_SMALLEST_ENTRY = 1e-30  # lower bound of the kernel's entries, which avoids slow subnormal products
-_PADDING = -1e30  # zero mass, but with a gradient
+_LARGEST_SCALE = 2.0e4  # scales above this or below its inverse are absorbed into the potentials
+_SMALLEST_ENTRY = 1e-30  # smaller kernel entries become 0, which avoids slow subnormal products
+_PADDING = -1e30  # log score of padding: no mass, but unlike infinity a finite gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +56,14 @@ class SuperGlueNet(nn.Module):
     def forward(
         self, pairs: Sequence[tuple[ImageKeypoints, ImageKeypoints]], iterations: int
     ) -> list[torch.Tensor]:
-        """Return log assignments float32 (N + 1, M + 1) of pairs with keypoints, dustbins last."""
+        """Return log assignments float32 (N + 1, M + 1), dustbins last.
+
+        Each image must have keypoints.
+        """
         images = [image for pair in pairs for image in pair]
         lengths = [len(image.scores) for image in images]
         device = self.bin_score.device.type
-        # half precision would round positions to several pixels
+        # half precision would round positions by several pixels
         with torch.autocast(device, enabled=False):
             scores = torch.cat([image.scores for image in images])
             located = torch.column_stack([torch.cat([image.xy for image in images]), scores])
@@ -160,7 +164,10 @@ def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: 
 
 
 def normalise_keypoints(xy: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """Normalise pixels (N, 2) by the image's centre and larger side; the first centre is (0, 0)."""
+    """Normalise pixel coordinates (N, 2) by the image's centre and larger side.
+
+    The centre of the first pixel is (0, 0).
+    """
     size = torch.tensor([width, height], dtype=xy.dtype, device=xy.device)
     return (xy - size / 2) / (0.7 * size.max())
 
@@ -168,7 +175,10 @@ def normalise_keypoints(xy: torch.Tensor, width: int, height: int) -> torch.Tens
 def mutual_matches(
     log_assignment: torch.Tensor, threshold: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return mutual best matches int64 (K, 2), sorted by row, and scores (K,) of (N + 1, M + 1)."""
+    """Return the mutual best matches of log assignments (N + 1, M + 1), and their scores (K,).
+
+    Matches, int64 (K, 2), are sorted by row.
+    """
     inner = log_assignment[:-1, :-1]
     values, columns = inner.max(dim=1)
     rows = torch.arange(len(inner), device=inner.device)
@@ -182,7 +192,7 @@ def log_optimal_transport(
 ) -> list[torch.Tensor]:
     """Compute log partial assignments by Sinkhorn's algorithm, dustbins last.
 
-    Rows and columns of the exponential sum to 1, the dustbins' to M (row) and N (column).
+    In the exponential, rows and columns sum to 1, the dustbin's row to M and its column to N.
 
     Parameters
     ----------
@@ -211,8 +221,8 @@ def log_optimal_transport(
 def _potentials(
     couplings: torch.Tensor, row_mass: torch.Tensor, column_mass: torch.Tensor, iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return u (B, N + 1) and v (B, M + 1), float64, with the masses of exp(Z + u + v)."""
-    # 1 at padding, to avoid 0 / 0 and log(0)
+    """Return u (B, N + 1) and v (B, M + 1), float64, such that exp(Z + u + v) has the masses."""
+    # 1 at padding, which is added to avoid 0 / 0 and log(0)
     row_padding = (row_mass == 0).to(couplings.dtype)
     column_padding = (column_mass == 0).to(couplings.dtype)
 
@@ -238,7 +248,7 @@ def _potentials(
 
 
 def _kernel(couplings: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    # large scores and potentials cancel: float32 would keep four digits
+    # large scores and potentials cancel: in float32 only four digits would remain correct
     exponents = (couplings + u[:, :, None]) + v[:, None, :]
     return functional.threshold(exponents.to(couplings.dtype).exp(), _SMALLEST_ENTRY, 0.0)
 

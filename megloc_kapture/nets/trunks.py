@@ -27,8 +27,8 @@ _MINIMUM = 1e-6
 class Vgg16Features(nn.Sequential):
     """VGG-16 (configuration D) up to layer ``last``, numbered as torchvision's ``features``.
 
-    Layer 28 is conv5_3 without its ReLU (512 channels, 1/16 of the image size), layer 29 that ReLU.
-    Max pooling drops an odd last row or column.
+    Layer 28 is conv5_3 without its ReLU (512 channels, 1/16 of the image size), and layer 29 is
+    that ReLU. Max pooling drops an odd last row or column.
     """
 
     def __init__(self, *, last: int) -> None:
@@ -59,7 +59,7 @@ class Bottleneck(nn.Module):
     """Bottleneck block of a ResNet, with the stride on the 3x3 convolution.
 
     ``strided_first`` puts the stride on the first 1x1 convolution instead. ``bias`` adds biases to
-    the convolutions; ``epsilon`` is that of the batch normalisations.
+    the convolutions; ``epsilon`` is added to the variances in batch normalisation.
     """
 
     def __init__(
@@ -136,6 +136,6 @@ def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> tor
 
     Power 1 is the mean, infinity the maximum; 0 is invalid. The result is float32 or float64.
     """
-    # half precision overflows at 41 to the third power
+    # the third power of 41 overflows in half precision
     values = features if features.dtype == torch.float64 else features.float()
     return values.clamp(min=_MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)

@@ -24,25 +24,25 @@ from megloc_kapture.values import Options, RigidTransform
 # squared Mahalanobis distance of two poses above which they differ significantly: chi-squared
 # quantile, six degrees of freedom, p = 0.999
 CHI2_OF_CHANCE = 22.46
-# smaller displacements are rounding errors, however small the covariance; pixels of the level
+# smaller displacements, in pixels of the level, are rounding errors, however small the covariance
 _LEAST_PX = 1e-3
 Float64 = NDArray[np.float64]
 _CHANGE = 0.5  # largest change of the residuals by a finite difference, in standard deviations
-# the objective's curvature must be at least this share of the normal equations'
+# the curvature of the objective must be at least this share of that of the normal equations
 _LEAST_SHARE = 0.02
-# displacement of points on either side of a finite difference, pixels of the level
+# displacement of points on either side of a finite difference, in pixels of the level
 _CURVATURE_PX = 0.5
-# perturbed starts along each direction, in steps of _CURVATURE_PX
+# perturbations along each direction, in steps that move points by about _CURVATURE_PX
 _START_STEPS = (-4.0, -2.0, 0.0, 2.0, 4.0)
-# the pose is undetermined if the eigenvalues of the normal equations have a smaller ratio
+# the pose is undetermined below this ratio of the normal equations' smallest to largest eigenvalue
 _LEAST_CURVATURE = 1e-7
 
 
 class RenderingOptions(Options):
     appearance: Appearance = Field(
         default="normalised",
-        description="compared quantity: brightness with locally normalised contrast (day and "
-        "night), or each colour likewise (colours)",
+        description="normalised: compare brightness with locally normalised mean and contrast, "
+        "also between day and night; colours: compare red, green and blue, normalised likewise",
     )
     max_references: int = Field(
         default=4, gt=0, description="largest number of reference images with depth"
@@ -61,7 +61,7 @@ class RenderingOptions(Options):
         description="number of pyramid levels, each half the size of the previous one",
     )
     max_translation_m: float = Field(
-        default=0.5, gt=0, description="largest accepted movement of the centre"
+        default=0.5, gt=0, description="largest accepted movement of the camera centre"
     )
     max_rotation_deg: float = Field(default=5.0, gt=0, description="largest accepted rotation")
     require_consistent_map: bool = Field(
@@ -88,7 +88,10 @@ class RenderingOptions(Options):
         default=0.2, ge=0, le=1, description="share of the query that the references must cover"
     )
     max_overlap_loss: float = Field(
-        default=0.1, ge=0, le=1, description="share of this overlap that the new pose may lose"
+        default=0.1,
+        ge=0,
+        le=1,
+        description="share of the overlap at the old pose that the new pose may lose",
     )
 
 
@@ -137,7 +140,7 @@ def accept_or_keep(
         return PoseRefinement(start, "the images do not determine the pose", measures)
     if measures["moved_px"] < _LEAST_PX or not measures["squared_distance"] > CHI2_OF_CHANCE:
         return PoseRefinement(
-            start, "the images do not distinguish it from the refined pose", measures
+            start, "the images do not distinguish the old pose from the refined pose", measures
         )
     return PoseRefinement(pose, "", measures, uncertainty)
 
@@ -145,7 +148,7 @@ def accept_or_keep(
 def squared_distance(
     old: RigidTransform, new: RigidTransform, covariance: NDArray[np.float64]
 ) -> float:
-    """Return the squared Mahalanobis distance of two poses; the covariance is that of ``Pose``."""
+    """Return the squared Mahalanobis distance of two poses; covariance (6, 6) as in ``Pose``."""
     old_from_new = old @ new.inverse()
     w, x, y, z = old_from_new.quat_wxyz
     turn = 2.0 * np.copysign(1.0, w) * np.array([x, y, z])
@@ -207,7 +210,7 @@ class Comparison:
 
 
 def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> Comparison:
-    """Compare the costs of two poses over the points that both see."""
+    """Compare the costs of two poses over the points that are visible from both."""
     aligned = [problem.nuisance_at(pose) for pose in (old, new)]
     rows = [problem.rows(at) for at in aligned]
     hidden = np.isnan(rows[0][:, 0, 0]) | np.isnan(rows[1][:, 0, 0])
@@ -216,7 +219,7 @@ def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransfor
     deviation = aligned[1].deviation
     gained = _losses(rows[0][~hidden], deviation) - _losses(rows[1][~hidden], deviation)
     before, after = (_fit(problem, each, deviation) for each in rows)
-    # sum of the gains divided by its standard error, if cells are independent and have mean 0
+    # sum of the cells' gains divided by its standard error, for independent gains with mean 0
     sums = np.bincount(problem.cells(new, ~hidden), gained)
     error = float(np.sqrt(np.square(sums).sum()))
     return Comparison(before, after, float(sums.sum()) / error if error > 0 else 0.0)
@@ -259,9 +262,9 @@ def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:
     """Estimate the pose covariance (6, 6), as in ``Pose``; None if the pose is undetermined.
 
     The sandwich estimate is clustered by cells of the query, so that correlated residuals enlarge
-    it (Liang and Zeger, Biometrika 1986). It uses the curvature of the objective because the normal
-    equations count the query's noise as gradient. Errors shared by the whole image (map poses,
-    depth, calibration) are not included.
+    it (Liang and Zeger, Biometrika 1986). It uses the curvature of the objective instead of the
+    normal equations, which count the query's noise as gradient. Errors shared by the whole image
+    (map poses, depth, calibration) are not included.
     """
     rows = problem.rows(at)
     scale2 = max(at.squared_scale, 1e-24)

@@ -37,7 +37,7 @@ from megloc_kapture.refinement.neural_field import (
     reduced_view,
 )
 
-# Adam's initial rates; they decay to a thirtieth
+# Adam's initial rates for planes, small networks and NeRF-W; they decay to a thirtieth
 _PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
 _DECAY = 1 / 30
 _KEEP_EVERY = 200
@@ -54,14 +54,16 @@ class FieldTrainingOptions(NetworkOptions):
         gt=0,
         description="time limit; results are reproducible only without it",
     )
-    rays_per_step: int = Field(default=2048, gt=0, description="random pixels of all images")
+    rays_per_step: int = Field(
+        default=2048, gt=0, description="number of rays, through random pixels of all images"
+    )
     max_side_px: int = Field(
         default=320,
         ge=16,
         description="longer side of the training images; larger ones are reduced",
     )
     depth_weight: float = Field(
-        default=5.5, ge=0, description="weight of the relative depth error in NeRF-W's loss"
+        default=5.5, ge=0, description="weight of the relative depth error, added to NeRF-W's loss"
     )
     held_out_every: int = Field(default=8, ge=0, description="hold out every N-th image; 0: none")
     lights: Lights = Field(
@@ -128,8 +130,8 @@ class FieldTrainer:
     ) -> tuple[NeuralField, dict[str, float]]:
         """Train to the last step; return the field and the PSNR in dB of each held-out image.
 
-        ``progress`` receives the step, the seconds and the held-out PSNR in dB of two images;
-        ``keep`` receives the state.
+        ``progress`` receives the step, the seconds and the PSNR in dB of the first two held-out
+        images; ``keep`` receives the state.
         """
         options, field = self.options, self._field
         start_s = time.monotonic() - self._seconds

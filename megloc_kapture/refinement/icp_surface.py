@@ -25,7 +25,7 @@ NORMAL_NEIGHBOURS = 20  # small_gicp's default
 _MAX_ITERATIONS = 20
 _ROTATION_EPSILON_RAD = 1e-4
 _TRANSLATION_EPSILON_M = 1e-4
-_CONVERGED = 5e-5  # convergence in radians and metres, a hundredth of the required accuracy
+_CONVERGED = 5e-5  # norm of the last step (radians, metres), a hundredth of the required accuracy
 # Cauchy scale with 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
 
@@ -34,16 +34,16 @@ class DepthCloudOptions(Options):
     max_depth_m: float = Field(
         default=4.0,
         gt=0,
-        description="largest depth, metres. The noise of structured light grows with the square "
-        "of the distance and is 2.6 cm here, the end of its rated range; raise it for "
-        "lasers",
+        description="largest depth, metres. The noise of structured-light sensors grows with the "
+        "square of the distance and is 2.6 cm at 4 m, the end of their rated range; raise the "
+        "limit for laser scanners",
     )
     max_jump: float = Field(
         default=0.05,
         gt=0,
         description="pixels whose depth differs from a neighbour's by more than this share of the "
-        "smaller are dropped as edges; on a plane at 80 degrees the steps of a "
-        "sensor with a focal length of 585 px are 0.014",
+        "smaller depth are dropped as edges; on a plane tilted by 80 degrees, with a focal length "
+        "of 585 px, the share is about 0.014",
     )
 
 
@@ -111,7 +111,7 @@ class Surface:
         return rows[:, 0].astype(np.int64), np.sqrt(squared[:, 0])
 
     def spacing(self) -> float:
-        """Return the median distance from a point to the farthest neighbour of its normal."""
+        """Return the points' median distance to the farthest neighbour used for their normals."""
         _, squared = self._tree.batch_knn_search(self.points, NORMAL_NEIGHBOURS)
         return float(np.sqrt(np.median(squared[:, -1])))
 
@@ -120,7 +120,7 @@ def downsample(points: Floats, voxel_m: float) -> Floats:
     """Average the points (N, 3) of each voxel: float64 (M, 3)."""
     if not len(points):
         return np.zeros((0, 3))
-    # voxel indices have 21 bits, too few far from the origin
+    # voxel indices have 21 bits, too few for points far from the origin
     origin = points.mean(axis=0)
     cloud = small_gicp.voxelgrid_sampling(np.ascontiguousarray(points - origin), voxel_m)
     return np.array(cloud.points())[:, :3] + origin
@@ -161,11 +161,11 @@ def fit_to_surface(
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    overlap: float
-    reach: float
-    # median distance from the planes within the far distance; infinite without points
+    overlap: float  # share of the points within the near distance from the surface
+    reach: float  # share of the points within the far distance
+    # median distance from the surface's planes, of points within the far distance; infinite if none
     residual_m: float
-    # points, normals: float64 (K, 3) in the cloud's frame, of points within the near distance
+    # points, normals: float64 (K, 3) in the points' frame, of points within the near distance
     points: Floats
     normals: Floats
     residuals_m: Floats  # float64 (K,), signed distances from the planes
@@ -246,7 +246,7 @@ def fit_weighted(
         if scale == 0:
             return transform
         weights = 1.0 / (1.0 + (relative / (_CAUCHY_EFFICIENT * scale)) ** 2) / noise[near] ** 2
-        # rotation about the centroid is nearly uncorrelated with translation
+        # rotations are about the camera centre, which is the origin of the points
         origin = np.array(transform.translation)
         jacobian = np.column_stack([np.cross(transformed - origin, normals), normals])
         weighted = jacobian * weights[:, None]

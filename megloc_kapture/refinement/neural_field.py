@@ -38,7 +38,7 @@ _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
 
 @dataclass(frozen=True, eq=False)
 class FieldView:
-    """A training image, like :class:`~.references.RenderingReference`, with optional depth."""
+    """A posed image, like :class:`~.references.RenderingReference`, with optional depth."""
 
     name: str
     image: NDArray[np.uint8]
@@ -55,7 +55,10 @@ class FieldView:
 
 
 class FieldFrame(Options):
-    """Frame of a field: ``x_field = (x_world - centre) / scale``; ``near``, ``far`` are depths."""
+    """Frame of a field: ``x_field = (x_world - centre) / scale``.
+
+    ``near`` and ``far`` are depths in the map's unit.
+    """
 
     centre: tuple[float, float, float]
     scale: float = Field(gt=0)
@@ -97,7 +100,7 @@ class NeuralField:
     ) -> None:
         self.module, self.frame, self.images = module, frame, tuple(images)
         self.device = next(module.parameters()).device
-        # threads share the field, and the memory of a GPU holds the samples of one chunk
+        # threads share the field, and the memory of a GPU may hold the samples of one chunk only
         self._rendering = Lock() if self.device.type == "cuda" else nullcontext()
         self.light_rows = torch.tensor(light_rows, device=self.device)
 
@@ -151,7 +154,7 @@ class NeuralField:
     def fit_appearance(
         self, rays: Rays, rgb: torch.Tensor, *, seed: int = 0
     ) -> torch.Tensor | None:
-        """Fit the embedding (A,) of rays to colours (N, 3); None without embeddings."""
+        """Fit an appearance embedding (A,) to the rays' colours (N, 3); None without embeddings."""
         embedding = self.module.appearance
         if embedding is None:
             return None
@@ -167,9 +170,9 @@ class NeuralField:
             rows = torch.randint(len(rgb), (min(_FIT_RAYS, len(rgb)),), generator=generator)
             rows = rows.to(self.device)
             part = replace(select(rays, rows), appearance=fitted.expand(len(rows), -1))
-            # transient pixels must not affect the appearance
             off = self.module.render(part).rgb - rgb[rows]
-            # loss is linear from a tenth of full scale
+            # the loss is linear for errors above a tenth of full scale, to limit the effect of
+            # transient objects on the appearance
             loss = torch.nn.functional.huber_loss(off, torch.zeros_like(off), delta=0.1)
             (fitted.grad,) = torch.autograd.grad(loss, [fitted])
             optimizer.step()
@@ -184,7 +187,10 @@ class NeuralField:
         return self.fit_appearance(rays, self._tensor(rgb.astype(np.float32) / 255)[rows])
 
     def held_out_psnr(self, view: FieldView) -> float:
-        """Return the PSNR in dB on the right half of an image, with appearance from the left."""
+        """Return the PSNR in dB on an image's right half, with the appearance of its left half.
+
+        NaN if a half has no usable pixel.
+        """
         camera, rgb, usable, _ = pixels_of(view, max(view.camera.width, view.camera.height))
         rays = self.rays(camera, view.cam_from_world)
         left = np.arange(camera.width * camera.height) % camera.width < camera.width // 2
@@ -217,7 +223,7 @@ def select(rays: Rays, rows: slice | torch.Tensor) -> Rays:
 def pixels_of(
     view: FieldView, max_side_px: int
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.bool_], Floats | None]:
-    """Return reduced camera, colours (N, 3), usable pixels (N,) and depths (N,) of a view."""
+    """Return a reduced view: camera, colours (N, 3), usable pixels (N,) and depths (N,)."""
     if view.image.shape != (view.camera.height, view.camera.width, 3):
         size = f"{view.camera.width}x{view.camera.height}"
         raise DataError(f"image {view.name}: {view.image.shape} does not fit a camera of {size}")

@@ -1,10 +1,11 @@
-"""Photometric alignment of reference images, lifted by depth, with a query.
+"""Photometric alignment of a query with reference images that have depth.
 
-At each pyramid level, coarse to fine, the residuals ``gain_i I(px(T X)) + bias_i - r`` of all
-references i are minimised over the pose T and a gain and a bias per reference and channel, by
-Levenberg-Marquardt. Since gain and bias apply to the query, this maximises correlation, as ECC does
-(Evangelidis and Psarakis, PAMI 2008). The loss is Geman-McClure's, with a scale from the residuals.
-The Schur complement eliminates gains and biases, which leaves six unknowns.
+At each pyramid level, coarse to fine, the residuals ``gain_i I(px(T X)) + bias_i - r`` are
+minimised over the pose T and a gain and a bias per reference i and channel, by Levenberg-Marquardt.
+I is the query, and X a point of reference i with value r. Since gain and bias apply to the query,
+this maximises correlation, as ECC does (Evangelidis and Psarakis, PAMI 2008). The loss is
+Geman-McClure's, with a scale from the residuals. The Schur complement eliminates gains and biases,
+which leaves six unknowns.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ LOSS_SCALE = 2.0
 _NUISANCE_STEPS = 3
 _NUISANCE_POINTS = 6000
 _MIN_GAIN = 0.05
-# cells along the query's longer side; residuals in a cell may be correlated
+# cells along the query's longer side; residuals within a cell may be correlated
 _CELLS = 10
 _MAX_STEPS = 12
 _LAST_GAIN = 1e-5
 _DAMPING = 1e-3
 _MOST_DAMPING = 1e2
-# smallest number of points for a cell's correlation, and smallest share that an unoccluded cell has
-# of a good cell's correlation
+# smallest number of points for the correlation of a cell; smallest correlation of an unoccluded
+# cell, as a share of the cells' 75th percentile
 _CELL_POINTS = 20
 _AGREES = 0.5
 
@@ -47,7 +48,7 @@ class Alignment:
     # gains, biases: float64 (G, C), per reference and channel
     gains: Float64
     biases: Float64
-    deviation: float
+    deviation: float  # robust standard deviation of the residuals
 
     @property
     def squared_scale(self) -> float:
@@ -64,8 +65,8 @@ class Alignment:
 class LevelProblem:
     """Residuals of chosen points at one level of the query, as functions of the pose.
 
-    ``near`` is a pose that gives the distance of the points; ``num_groups`` counts references,
-    including those without points.
+    ``near`` is an approximate pose, from which the depth of the points is taken; ``num_groups`` is
+    the number of references, including those without points.
     """
 
     def __init__(
@@ -152,7 +153,10 @@ class LevelProblem:
         return NormalEquations.of(sums, cost, count)
 
     def px_per_step(self) -> Float64:
-        """Return the approximate motion of points per unit of the pose, (6,), level pixels."""
+        """Return the approximate motion of points, in pixels of the level, per unit of the pose.
+
+        It has shape (6,), rotation first.
+        """
         focal = focal_px(self.camera) * self.level.scale_x
         return np.array([focal] * 3 + [focal / self._depth_m] * 3)
 
@@ -214,7 +218,7 @@ class NormalEquations:
         return pose_step, *self.nuisance_step(pose_step)
 
     def nuisance_step(self, pose_step: Float64 | None = None) -> tuple[Float64, Float64]:
-        """Return steps of gains and biases (G, C) for a step of the pose (6,), or for none."""
+        """Return steps of gains and biases (G, C) for a step of the pose (6,), by default zero."""
         right = -self.own_gradient
         if pose_step is not None:
             right = right - np.einsum("gcpi,p->gci", self.mixed, pose_step)
@@ -227,9 +231,9 @@ def empty_sums(num_groups: int, channels: int) -> tuple[Float64, ...]:
 
 
 def _solve_pairs(blocks: Float64, right: Float64) -> tuple[Float64, Float64]:
-    """Solve 2x2 systems (..., 3) for right sides (..., 2), with a ridge.
+    """Solve symmetric 2x2 systems (..., 3) for right sides (..., 2), with a ridge.
 
-    Systems are stored as gain gain, gain bias, bias bias.
+    A system is stored as its entries (gain, gain), (gain, bias) and (bias, bias).
     """
     first, cross, second = np.moveaxis(blocks, -1, 0)
     ridge = 1e-9 * (first + second) + 1e-12
@@ -267,7 +271,7 @@ def _levenberg_marquardt(problem: LevelProblem, at: Alignment, last_step_px: flo
         pose_step, gain_step, bias_step = step
         trial = at.moved(perturbed(at.cam_from_world, pose_step), gain_step, bias_step)
         new = problem.system_at(trial, scale2)
-        # compare means, so that points that leave the image have no effect
+        # compare mean costs, so that points leaving the image do not look like an improvement
         small = float(np.abs(pose_step) @ reach) < last_step_px
         if new.count >= MIN_POINTS and new.mean_cost < system.mean_cost:
             small = small or new.mean_cost > (1.0 - _LAST_GAIN) * system.mean_cost
@@ -281,7 +285,7 @@ def _levenberg_marquardt(problem: LevelProblem, at: Alignment, last_step_px: flo
 
 
 def unoccluded_points(problem: LevelProblem, at: Alignment) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the points in cells of the query that correlate with the references."""
+    """Return a mask (N,), False for points in cells where query and references do not correlate."""
     rows = problem.rows(at)
     seen = np.flatnonzero(~np.isnan(rows[:, 0, 0]))
     keep = np.ones(len(rows), np.bool_)

@@ -36,7 +36,7 @@ def camera_of(camera: Camera) -> tuple[int, NDArray[np.float64], float]:
 
 @compiled_loop
 def _project(camera, r, t, points, shown_at):
-    """Project points by the pose; fill camera coordinates, px, py and the derivatives of both.
+    """Project points by the pose; fill camera coordinates, px, py, and derivatives of px and py.
 
     The viewing angle is limited because a distortion polynomial may fold back into the image.
     """
@@ -72,7 +72,7 @@ def _project(camera, r, t, points, shown_at):
 def _corner(valid, x, y):
     """Return row and column of the upper left of the four pixels around a position, and its offset.
 
-    They are -1 if a pixel is invalid.
+    Row and column are -1 if any of the four is invalid.
     """
     h, w = valid.shape
     # false for NaN too
@@ -94,7 +94,10 @@ def _read(values, row, column, a, b, c):
 
 @compiled_loop
 def read_values(values, valid, x, y, out, readable):
-    """Interpolate values (N, C) at N pixels bilinearly; ``readable`` (N,) marks valid ones."""
+    """Interpolate ``values`` (h, w, C) bilinearly at N positions into ``out`` (N, C).
+
+    ``readable`` (N,) marks positions between valid pixels.
+    """
     for k in range(len(x)):
         row, column, a, b = _corner(valid, x[k], y[k])
         readable[k] = row >= 0
@@ -106,12 +109,13 @@ def read_values(values, valid, x, y, out, readable):
 
 @compiled_loop
 def evaluate(chosen, query, alignment, out):
-    """Evaluate residuals and derivatives per point: ``out`` float64 (N, C, 8), NaN where invisible.
+    """Evaluate residuals and derivatives per point: ``out`` float64 (N, C, 8).
 
-    ``out``: the residual, six derivatives by a left perturbation of the pose (rotation first), and
-    the query's value. ``chosen``: points (N, 3), values (N, C) and reference index (N,). ``query``:
-    a level (h, w, C), its valid pixels, its scale (2,) and its :func:`camera_of`. ``alignment``:
-    rotation and translation of ``cam_from_world``, gains and biases (G, C).
+    ``out``: the residual (NaN where invisible, the rest is then unset), six derivatives by a left
+    perturbation of the pose (rotation first), and the query's value. ``chosen``: points (N, 3),
+    values (N, C) and reference index (N,). ``query``: a level (h, w, C), its valid pixels, its
+    scale (2,) and its :func:`camera_of`. ``alignment``: rotation and translation of
+    ``cam_from_world``, gains and biases (G, C).
     """
     points, values, groups = chosen
     level, valid, scale_xy, camera = query
@@ -152,10 +156,11 @@ def evaluate(chosen, query, alignment, out):
 def normal_equations(rows, groups, squared_scale, sums):
     """Add up the robust normal equations of :func:`evaluate`; return cost sum and point count.
 
-    A point's ``e^2`` is the mean of its squared residuals over channels, its cost Geman and
-    McClure's ``s^2 / 2  e^2 / (s^2 + e^2)``; an infinite s^2 gives least squares. ``sums``, added
-    to: pose (6, 6), upper half; pose with gain and bias (G, C, 6, 2); gain gain, gain bias, bias
-    bias (G, C, 3); gradients of the pose (6,) and of gain and bias (G, C, 2).
+    A point's ``e^2`` is the mean of its squared residuals over channels, and its cost is Geman and
+    McClure's ``s^2 / 2  e^2 / (s^2 + e^2)``; an infinite s^2 gives least squares. The results are
+    added to ``sums``: the matrix of the pose (6, 6), upper half; pose with gain and bias (G, C, 6,
+    2); entries (gain, gain), (gain, bias) and (bias, bias) (G, C, 3); gradients by the pose (6,)
+    and by gain and bias (G, C, 2).
     """
     pose, mixed, blocks, pose_gradient, own_gradient = sums
     channels = rows.shape[1]
@@ -214,7 +219,7 @@ def evaluated_equations(chosen, query, alignment, squared_scale, sums):
 def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths):
     """Assign points (N, 3) to cells of an image; keep each cell's smallest depth in ``nearest``.
 
-    ``cells`` and ``depths`` (N,) are filled with flat cell indices, -1 outside, and depths.
+    ``cells`` (N,) is filled with flat cell indices, -1 outside the image, and ``depths`` (N,).
     """
     columns = nearest.shape[1]
     shown_at = np.empty((11, min(len(points), _ROWS)))
@@ -238,8 +243,8 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
 def strongest_per_cell(x, y, energy, wanted, cell_px, best):
     """Find the point with the largest ``energy`` (h, w) in each cell of a level.
 
-    ``x`` and ``y`` (N,) are pixels of the level. ``best`` is filled with point indices, -1 for zero
-    energy.
+    ``x`` and ``y`` (N,) are pixels of the level. ``best`` is filled with point indices, -1 for
+    cells without a wanted point of positive energy.
     """
     best[:] = -1
     h, w = energy.shape

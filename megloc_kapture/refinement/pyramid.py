@@ -1,8 +1,8 @@
 """Image pyramids and depth points for photometric alignment.
 
 A reference is compared at those pixels of its depth map that have the strongest gradient per grid
-cell (Engel et al., "Direct Sparse Odometry", PAMI 2018, section 3.2). Means exclude masked pixels
-(normalised convolution, Knutsson and Westin, CVPR 1993).
+cell (Engel et al., "Direct Sparse Odometry", PAMI 2018, section 3.2). Local means exclude masked
+pixels (normalised convolution, Knutsson and Westin, CVPR 1993).
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from megloc_kapture.geometry.cameras import bearing_rays, in_image, project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
-# depth samples along the longer side of a depth map; about four per point
+# depth samples along the longer side of a depth map: six per chosen point at a level of 640 px
 _GRID = 320
-# a larger relative second difference of inverse depth is an edge; on planes it is zero
+# larger second differences of inverse depth, relative to it, are edges; on planes they are zero
 _JUMP = 0.05
 # cells of the visibility buffer along an image's longer side
 _CELLS = 80
-# points behind a cell's nearest by more than this share are occluded; slanted ground varies as much
+# points whose depth exceeds that of their cell's nearest point by a larger share are occluded;
+# within a cell, the depth of slanted ground varies by as much
 _HIDES = 0.15
 Float64 = NDArray[np.float64]
 Appearance = Literal["normalised", "colours"]
@@ -50,13 +51,13 @@ class DepthPoints:
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    # per reference bool (N,), visible points
+    # per reference, bool (N,): points visible in the image
     seen: tuple[NDArray[np.bool_], ...]
     covered: NDArray[np.bool_]  # bool (rows, columns), cells of the image with a point
 
 
 def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
-    """Lift those points of a depth map that its image sees and that are not on depth edges."""
+    """Back-project those pixels of a depth map that its image sees, except at depth edges."""
     if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
         raise DataError(
             f"a depth map of {depth.depth_m.shape} does not fit a camera of "
@@ -82,7 +83,7 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
         px = project(camera, RigidTransform.identity(), points)
         inside = in_image(camera, px)
         points, px = points[inside], px[inside]
-        # points behind an edge of the depth camera may be hidden from the image
+        # points behind a depth edge may be hidden from the image's camera
         alone = DepthPoints(points, px)
         seen = visibility([alone], camera, RigidTransform.identity()).seen[0]
         points, px = points[seen], px[seen]
@@ -217,7 +218,7 @@ def _normalised(plane: Float32, used: Float32) -> Float32:
     share = np.maximum(_box_mean(used), np.float32(1e-3))
     mean = _box_mean(plane * used) / share
     centred = np.asarray(plane - mean, np.float32)
-    # deviations are from each pixel's own window mean, which is close to its neighbours'
+    # each pixel's deviation is from the mean of its window, close to those of its neighbours
     variance = _box_mean(centred * centred * used) / share
     floor = _FLAT * float(np.average(variance, weights=used)) if used.any() else 0.0
     result = centred / np.sqrt(variance + np.float32(max(floor, 1e-8)))

@@ -1,8 +1,8 @@
 """Reference images for refinement by rendering: selection, preparation, map consistency.
 
 Consistency is tested by leave-one-out refinement of map images (Stone, JRSS B 1974) against images
-with another viewing angle. An image contradicts the map if its displacement is significant by the
-claimed covariance and exceeds the resolution of alignment. Errors that all images share are not
+from other viewpoints. An image contradicts the map if its displacement is significant by the
+estimated covariance and exceeds the resolution of alignment. Errors that all images share are not
 detected.
 """
 
@@ -31,12 +31,12 @@ from megloc_kapture.values import Camera, RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
 # held-out images: largest and smallest number of displacements (five are all above the true median
-# with a chance of 1 in 32), and number of images tried
+# with a chance of 1 in 32), and largest number of images tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
 # smallest ratio of baseline to surface distance: an angle of about 6 deg between views
 _MIN_PARALLAX = 0.1
-# candidate references: the overlap is bounded for the nearest images, and measured for those with
-# the largest bounds
+# candidate references: an upper bound of the overlap is computed for the nearest images, and the
+# overlap itself for those with the largest bounds
 _NEAREST, _BEST = 200, 6
 _ASKED_POINTS = 300
 _MIN_SHARED = 0.1
@@ -137,10 +137,10 @@ class Displacement:
     moved_m: float
     turned_deg: float
     moved_px: float
-    # claimed_m, claimed_deg: standard deviations by the claimed covariance
+    # claimed_m, claimed_deg: standard deviations of the refined pose by its estimated covariance
     claimed_m: float
     claimed_deg: float
-    squared_distance: float  # squared Mahalanobis distance by this covariance
+    squared_distance: float  # squared Mahalanobis distance by that covariance
 
     @property
     def contradicts(self) -> bool:

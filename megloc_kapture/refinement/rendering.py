@@ -47,11 +47,12 @@ from megloc_kapture.refinement.references import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _MAX_STARTS, _START_POINTS = 5, 2500
-# alignment ends with a step this small, in pixels: at the finest level, and at the other levels
+# alignment ends with a step this small, in pixels of the level: finest level, other levels
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
-# pixels of a level per chosen point, and points of a reference on coarse levels
+# pixels of a level per chosen point of a reference; number of points if that gives fewer
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
-# if a perturbed start decreases the cost by more standard errors, the unperturbed is not tried
+# if alignment from perturbed poses decreases the cost by at least this many standard errors, the
+# unperturbed pose is not aligned at the finest level as well
 _CLEAR = 4.0
 
 
@@ -64,7 +65,8 @@ def refine_by_rendering(
     """Refine the pose of an image, in metres, by warping references with depth into it.
 
     ``measures`` of the result: cost (robust loss, 0 to 0.5), correlation and overlap before and
-    after, decrease of the cost in standard errors, motion in m and deg, points and references.
+    after; decrease of the cost in standard errors; motion in m, deg and px; numbers of points and
+    references; if the pose is determined, standard deviations and the squared Mahalanobis distance.
     """
     options = options or RenderingOptions()
     return _Refining(query, references, options).refine(cam_from_world)
@@ -95,7 +97,7 @@ def displacement_by_rendering(
     """Return the displacement of a presumably correct pose by :func:`refine_by_rendering`.
 
     If the result is rejected, the displacement is that of the nearest minimum. None if overlap or
-    correlation is too small, or the minimum is out of bounds.
+    correlation is too small, the images do not determine the pose, or the minimum is out of bounds.
     """
     options = options or RenderingOptions()
     refiner = _Refining(query, references, options)
@@ -134,7 +136,7 @@ class _Refining:
         clear = searched.accepted and searched.measures["significance"] >= _CLEAR
         if clear or coarsest == 0:
             return searched
-        # the best perturbed start may lead away from a nearly correct pose
+        # the best perturbed pose may lead away from a nearly correct pose
         direct = self._decide(start, overlap, self._align(0, start, sight))
         if not searched.accepted:
             return direct if direct.accepted else searched

@@ -2,7 +2,7 @@
 
 Depth and poses, or a homography, transform keypoints into the other image. As in glue-factory's
 ``gt_generation``, partners are mutual nearest neighbours, near in both images and visible;
-unmatched keypoints are far from all others; the rest is ignored.
+unmatched keypoints are far from all keypoints of the other image; the rest is ignored.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ UNMATCHED, IGNORED = -1, -2
 POSITIVE_PX, NEGATIVE_PX = 3.0, 5.0
 # largest relative depth difference of a visible point
 _MAX_DEPTH_ERROR = 0.03
-# grid of pixels to measure overlap
+# grid of pixels on which overlap is measured
 _GRID = (24, 18)
 
 Floats = NDArray[np.float64]
@@ -61,8 +61,8 @@ def labels_of_views(
 ) -> Labels:
     """Label keypoints (N, 2) and (M, 2) by depth and poses.
 
-    A keypoint without depth is unmatched if it is farther than NEGATIVE_PX (Sampson distance)
-    from the epipolar curves of all keypoints without partner, else ignored.
+    A keypoint without depth is unmatched if its Sampson distance from all keypoints of the other
+    image that depth leaves ignored is larger than NEGATIVE_PX, else ignored.
     """
     a_in_b, known_a, visible_a = reproject(px_a, a, b)
     b_in_a, known_b, visible_b = reproject(px_b, b, a)
@@ -102,9 +102,10 @@ def labels_of_homography(
 def reproject(
     px: NDArray[np.floating[Any]], a: PosedView, b: PosedView
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Transform pixels (N, 2) of a into b by depth.
+    """Transform pixels (N, 2) of image a into image b by depth.
 
-    Returns pixels (N, 2), NaN without depth, and masks (N,): with depth in a, and visible in b.
+    Returns pixels (N, 2), NaN without depth, and two masks (N,): pixels with depth in a, and pixels
+    visible in b.
     """
     points, known = lift_keypoints(
         px, a.depth.depth_m, a.camera, a.depth.camera, a.depth.image_from_depth
@@ -119,7 +120,7 @@ def reproject(
 
 
 def overlap(a: PosedView, b: PosedView) -> float:
-    """Return the smaller of the two shares of pixels with depth that the other image sees."""
+    """Return the smaller of two shares: pixels of an image with depth that the other image sees."""
     shares = []
     for view, other in ((a, b), (b, a)):
         size = view.camera.width, view.camera.height

@@ -1,7 +1,7 @@
 """Trained networks, their loss and their metrics on held-out pairs.
 
-SuperGlue is trained on frozen features, or a descriptor network under a frozen detector, as in
-MegLoc (section "local features").
+SuperGlue is trained on frozen features, or a descriptor network is trained with a frozen detector,
+as in MegLoc (section "local features").
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.pairs import TrainingPair
 from megloc_kapture.values import ImageFeatures, RigidTransform
 
-_FEATURES_KEPT = 1024  # images
+_FEATURES_KEPT = 1024  # number of images whose features are cached
 _FIRST_SCALE = 10.0  # initial scale of descriptor products
 _FIRST_DUSTBIN = 0.7  # initial cosine of the dustbin
-_CONFIDENT = 0.2  # the matcher's threshold
+_CONFIDENT = 0.2  # SuperGlue's threshold on the scores of matches
 
 Image = NDArray[np.uint8]
 AUC_DEG = (5, 10, 20)
@@ -64,7 +64,7 @@ class PreparedPair:
 
 
 class FrozenFeatures:
-    """Best keypoints of an extractor; those of named images are cached."""
+    """Best keypoints of an extractor; those of images with a key are cached."""
 
     def __init__(self, extractor: LocalFeatureExtractor, max_keypoints: int) -> None:
         self.extractor, self._max_keypoints = extractor, max_keypoints
@@ -113,7 +113,7 @@ class XFeatDescriber(nn.Module):
         super().__init__()
         name = extractor.options.descriptor_weights or extractor.options.weights
         network: Any = load_xfeat(read_weights(find_weights(name)), name)
-        # as in inference, faster on a CPU
+        # channels last as in inference, since it is faster on a CPU
         self._network = network.to(memory_format=torch.channels_last)
         self.net = network.net
         for part in (self.net.heatmap_head, self.net.keypoint_head, self.net.fine_matcher):
@@ -159,8 +159,8 @@ class ProductHead(nn.Module):
 def begin_at_products(net: SuperGlueNet) -> None:
     """Initialise a new SuperGlue to match by products of descriptors, as :class:`ProductHead` does.
 
-    Last layers of keypoint encoder and messages are zero, the final projection is the identity
-    (residual branches that begin at zero: Bachlechner et al., UAI 2021).
+    The last layers of the keypoint encoder and of the messages are zero, as in residual branches
+    that begin at zero (Bachlechner et al., UAI 2021). The final projection is a scaled identity.
     """
     perceptrons = [module for module in net.modules() if isinstance(module, nn.Sequential)]
     for last in (net.final_proj, *(perceptron[-1] for perceptron in perceptrons)):
@@ -198,7 +198,7 @@ class PairModel(nn.Module):
         self.head, self.describer, self._iterations = head, describer, iterations
 
     def forward(self, pairs: Sequence[PreparedPair]) -> torch.Tensor:
-        """Return the mean loss (), 0 without keypoints."""
+        """Return the mean loss () of pairs, 0 for pairs with an image without keypoints."""
         usable = [pair for pair in pairs if pair.usable]
         if not usable:
             return 0.0 * next(self.head.parameters()).sum()
@@ -236,8 +236,8 @@ class PairModel(nn.Module):
 def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor:
     """Return the negative log likelihood () of labels for log assignments (N + 1, M + 1).
 
-    SuperGlue's equation 10, with equal weights of the means over matched and unmatched keypoints
-    (LightGlue, equation 9). Ignored keypoints do not count.
+    This is SuperGlue's equation 10, but with equal weights for the mean over matched and the mean
+    over unmatched keypoints, as in LightGlue's equation 9. Ignored keypoints do not count.
     """
     device = log_assignment.device
     rows, columns = torch.from_numpy(labels.matches()).to(device).T
@@ -252,9 +252,9 @@ def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor
 class HeldOutResult:
     pairs: int
     loss: float  # mean over the pairs
-    precision: float  # correct share of the matches of labelled keypoints
-    recall: float  # share of the labelled matches that are found
-    # area under the curve of the relative pose error up to 5, 10 and 20 degrees, in [0, 1]
+    precision: float  # share of correct matches among those with a labelled keypoint
+    recall: float  # share of the labelled matches that the network returns
+    # area under the recall curve of the relative pose error up to 5, 10 and 20 degrees, in [0, 1]
     auc: tuple[float, ...]
 
 
@@ -277,17 +277,16 @@ def held_out_result(model: PairModel, pairs: Sequence[PreparedPair]) -> HeldOutR
 def judged(
     matches: NDArray[np.int64], labels: Labels
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks (K,) of correct matches and of matches with a label."""
+    """Return masks (K,) of correct matches and of matches with a labelled keypoint."""
     a, b = labels.partner_a[matches[:, 0]], labels.partner_b[matches[:, 1]]
     return a == matches[:, 1], (a != IGNORED) | (b != IGNORED)
 
 
 def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
-    """Return the larger error of rotation and translation direction in degrees; infinite without a
-    pose.
+    """Return the larger of the errors of rotation and translation direction, in degrees.
 
-    As in SuperGlue's evaluation, the sign of the translation is ignored, and without a baseline
-    the translation.
+    As in SuperGlue's evaluation, the sign of the translation is ignored. Without a baseline, only
+    the rotation counts. If no pose is estimated, the error is infinite.
     """
     views, truth = pair.pair.views, pair.pair.b_from_a
     assert views is not None and truth is not None

@@ -1,8 +1,8 @@
 """Training pairs: images of a kapture with depth and poses, or views of single photographs.
 
-Sources draw from a given generator and keep no state: a step's pairs depend on seed and step only.
-Views of a photograph have random homographies and light (DeTone et al., CVPR workshops 2018,
-section 5).
+Sources draw pairs with a given random generator and keep no state, so that a step's pairs depend on
+seed and step only. Views of a photograph have random homographies and lighting (DeTone et al., CVPR
+workshops 2018, section 5).
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from megloc_kapture.values import RigidTransform
 # candidate pairs, before their overlap is measured
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
 _VIEWS_KEPT = 64
-# bounds of the overlap bins, from which pairs are drawn equally
+# bounds of the overlap bins, from which pairs are drawn with equal probability
 _OVERLAP_BINS = (0.1, 0.3, 0.5, 0.7)
-# views of a photograph: smallest size relative to it, largest rotation, and displacement of the
-# corners as a share of the view's sides
+# views of a photograph: smallest size relative to the largest that fits, largest rotation, and
+# largest displacement of the corners as a share of the view's sides
 _MIN_SCALE, _MAX_ANGLE_DEG, _PERSPECTIVE = 0.5, 45.0, 0.2
 
 Floats = NDArray[np.float64]
@@ -54,8 +54,8 @@ _HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 class TrainingPair:
     images: tuple[Image, Image]  # uint8 (H, W, 3), RGB
     keys: tuple[str, str] | None  # cache keys; None for images drawn only once
-    label: Labelling  # labels of keypoints (N, 2) and (M, 2) of the images
-    # None under a homography
+    label: Labelling  # returns the labels of keypoints (N, 2) and (M, 2) of the images
+    # None if a homography relates the images
     views: tuple[PosedView, PosedView] | None = None
 
     @property
@@ -68,9 +68,9 @@ class TrainingPair:
 
 
 class PosedPairs:
-    """Pairs of a kapture's images with poses and depth, drawn evenly by overlap.
+    """Pairs of a kapture's images with poses and depth, drawn evenly from bins of overlap.
 
-    ``measured`` is a file of pairs with overlaps, read if present, else written.
+    ``measured`` is a file of candidate pairs and their overlaps, read if present, else written.
     """
 
     def __init__(
@@ -94,8 +94,9 @@ class PosedPairs:
             overlaps = np.fromiter(shares, np.float64, len(near))
         if not len(near):
             raise DataError(
-                "no two images have a pose and a depth map with their timestamp (trajectories.txt, "
-                "records_depth.txt)",
+                "no two images have a pose and a depth map of their timestamp (trajectories.txt, "
+                "records_depth.txt) and viewing directions within "
+                f"{_CANDIDATES.max_angle_deg:g} degrees",
                 path=folder.root,
             )
         if measured is not None and not measured.is_file():
@@ -188,10 +189,10 @@ def _size(view: PosedView) -> tuple[int, int]:
 def random_view(
     image: Image, size: tuple[int, int], rng: np.random.Generator
 ) -> tuple[Image, Floats]:
-    """Warp a random quadrilateral inside a photograph to a view of a size (w, h).
+    """Warp a random quadrilateral inside a photograph to a view of the given size (w, h).
 
     Returns the view, uint8 (h, w, 3), and ``view_from_image``, float64 (3, 3), for pixel
-    coordinates with the first centre at (0.5, 0.5).
+    coordinates with the first pixel's centre at (0.5, 0.5).
     """
     width, height = size
     sides = np.array([image.shape[1], image.shape[0]], np.float64)
@@ -201,14 +202,14 @@ def random_view(
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     corners = (perturbed - rectangle.mean(axis=0)) @ rotation.T
     extent = np.ptp(corners, axis=0)
-    # the largest part of the photograph that fits, times the scale
+    # scale to the largest size that fits in the photograph, times a random factor
     corners *= rng.uniform(_MIN_SCALE, 1.0) * (sides / extent).min()
     corners -= corners.min(axis=0)
     corners += rng.uniform(0, 1, 2) * (sides - corners.max(axis=0))
     view_from_image = cv2.getPerspectiveTransform(
         corners.astype(np.float32), rectangle.astype(np.float32)
     )
-    # OpenCV's warp has the first pixel's centre at (0, 0)
+    # in OpenCV's warp, the first pixel's centre is at (0, 0)
     warp = np.linalg.inv(_HALF) @ view_from_image @ _HALF
     view = cv2.warpPerspective(
         image, warp, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -217,7 +218,7 @@ def random_view(
 
 
 def relit(image: Image, rng: np.random.Generator) -> Image:
-    """Change gamma, exposure, cast, noise, blur and JPEG at random."""
+    """Change gamma, exposure, colour cast, blur, noise and JPEG quality at random."""
     gamma, exposure = np.exp2(rng.uniform(-1, 1, 2))
     cast = np.exp2(rng.normal(0, 0.12, 3))
     noise, blur = rng.uniform(0, 0.04), rng.uniform(0, 1.2)

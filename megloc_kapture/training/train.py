@@ -1,6 +1,7 @@
 """Training of matchers and descriptors: a seeded loop, its options and its files.
 
-A step's pairs depend on seed and step only, so the state consists of networks, optimizer and step.
+A step's pairs depend on seed and step only, so the state consists of networks, optimizer, step and
+curves.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class TrainingOptions(NetworkOptions):
     """Options of training SuperGlue on a frozen extractor's features."""
 
     half_precision: bool = Field(
-        default=False, description="bfloat16, except for keypoints, transport and loss"
+        default=False, description="bfloat16, except for keypoint positions, transport and loss"
     )
     features: PluginChoice = PluginChoice(name="superpoint")
     max_keypoints: int = Field(default=512, gt=0, description="number of best keypoints per image")
@@ -70,7 +71,7 @@ class TrainingOptions(NetworkOptions):
     learning_rate: float = Field(
         default=1e-4,
         gt=0,
-        description="learning rate of Adam for half of the steps; then decays to 1 %",
+        description="learning rate of Adam in the first half of the steps; then it decays to 1 %",
     )
     layers: int = Field(
         default=18,
@@ -82,7 +83,8 @@ class TrainingOptions(NetworkOptions):
         default=50, gt=0, description="iterations in training and evaluation"
     )
     matcher_weights: str | None = Field(
-        default=None, description="initial SuperGlue; none: random weights"
+        default=None,
+        description="initial SuperGlue; none: a new network that starts as nearest neighbours",
     )
     check_every: int = Field(
         default=1000, gt=0, description="steps between evaluations and checkpoints"
@@ -94,16 +96,17 @@ class TrainingOptions(NetworkOptions):
 
 
 class DescriptorOptions(TrainingOptions):
-    """Options of training descriptors of a frozen detector's keypoints."""
+    """Options of training a descriptor network with a frozen detector."""
 
     through: Literal["superglue", "products"] = Field(
         default="superglue",
-        description="superglue: with SuperGlue, as in MegLoc; products: for nearest neighbours",
+        description="superglue: trained together with SuperGlue, as in MegLoc; products: trained "
+        "for nearest-neighbour matching",
     )
 
 
 def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
-    # plugins may not have descriptor_size
+    # extract from an image to learn the size, since plugins need not have descriptor_size
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
     size = extractor.extract(noise).descriptors.shape[1]
     with torch.random.fork_rng(devices=[]):
@@ -127,7 +130,7 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
 
 
 class Trainer:
-    """A seeded training; ``rows`` are the curves up to ``step``, by COLUMNS, NaN if unknown."""
+    """A seeded training; ``rows`` are the curves up to ``step`` with COLUMNS, NaN if unknown."""
 
     def __init__(self, options: TrainingOptions) -> None:
         self.options = options
@@ -152,11 +155,11 @@ class Trainer:
     def train(
         self, sources: Sequence[PairSource], work: Work = HERE, *, threads: int = 1
     ) -> Iterator[int]:
-        """Train on pairs drawn evenly from the sources; yield the step at evaluations."""
+        """Train on pairs drawn evenly from the sources; yield the step after each evaluation."""
         options, losses = self.options, []
         steps = range(self.step, options.steps)
         threaded = ThreadPoolExecutor(threads) if threads > 1 else nullcontext()
-        # set for all threads: feature extraction in a thread would toggle it during a step
+        # disable TF32 for all threads: feature extraction in a thread would toggle it in a step
         with without_tf32(self._device), threaded as pool:
             prepared = ordered_map(
                 lambda step: self._pairs(sources, step), steps, pool, window=2 * threads
@@ -182,7 +185,7 @@ class Trainer:
         }
 
     def evaluate(self) -> list[float]:
-        """Return the fourth and later COLUMNS: means over held-out sources, NaN without these."""
+        """Return the fourth and later COLUMNS: means over held-out sources, NaN without any."""
         self.model.eval()
         self.results = {
             name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
@@ -305,7 +308,7 @@ def _check_data(
 
 
 def _check_same_training(output: Path, record: Mapping[str, Any]) -> None:
-    """Raise OutputError unless the files are of the same training."""
+    """Raise OutputError unless the existing files are from the same training."""
     manifest = output.with_suffix(".json")
     try:
         known = json.loads(read_content(manifest)).get("training")
@@ -336,6 +339,6 @@ def _write(trainer: Trainer, output: Path, record: Mapping[str, Any]) -> None:
     results = {name: asdict(result) for name, result in trainer.results.items()}
     manifest = {"training": record, "step": trainer.step, "held_out": results}
     write_json(output.with_suffix(".json"), manifest)
-    # written last: if the state exists, the other files are complete
+    # written last, so that the other files are never older than the state
     progress = {"step": trainer.step, "rows": trainer.rows}
     write_bytes(output.with_suffix(".state.pt"), state_bytes(model, trainer.optimizer, progress))
