@@ -88,8 +88,9 @@ _DEFAULT_GROUP = ImageGroup()
 class Benchmark:
     """The rules of a benchmark.
 
-    ``world`` relates the local frame of the truth to the official frame of pose files; ``names`` is
-    the challenge's list, image -> name in a pose file; ``pairs`` are those of an MLAD challenge.
+    ``world`` transforms between the local frame, that of the map and the true poses, and the
+    official frame of pose files. ``names`` is the challenge's list, image -> name in a pose file;
+    ``pairs`` are the image pairs of an MLAD challenge.
     """
 
     protocol: Protocol = Protocol()
@@ -119,7 +120,7 @@ class Benchmark:
 def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = None) -> Benchmark:
     """Return the benchmark of a workspace's ``megloc/`` folder, of a dataset, or the default.
 
-    A dataset overrides the protocol of the workspace, but not its groups and frame.
+    A dataset overrides the protocol of the workspace, but not its groups, frame, names and pairs.
     """
     named = None if dataset is None else protocol_of(dataset)
     if side_tables is None:

@@ -28,7 +28,7 @@ _BOX = (400, 300)
 _GAP_PX, _MAX_LINES = 6, 120
 # number of candidates compared to find the one with the most matches
 _CANDIDATES_COMPARED = 50
-# distance of a match from its epipolar line
+# largest distance of an agreeing match from its epipolar line
 _MAX_ERROR_PX = 8.0
 AGREES, DISAGREES, UNKNOWN = "#12a150", "#e02424", "#f2b705"
 
