@@ -30,7 +30,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 # error: the server would reject the file or give wrong results for it; warning: some poses are
-# probably wrong, or some queries have none; note: for information
+# probably wrong or missing; note: for information
 Severity = Literal["error", "warning", "note"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 # largest number of printed findings of one kind; the JSON lists all
