@@ -51,7 +51,7 @@ _MIN_POSES = 3
 # largest number of poses compared in each convention, evenly spread over the file
 _SAMPLE = 500
 # a pose is near the map if its distance (see _frames) is at most _NEAR times the median in the best
-# convention, or at most _LEAST times the map's extent, as for directions one degree apart
+# convention, or at most _LEAST times the map's extent (directions then differ by about a degree)
 _NEAR, _LEAST = 2.0, 0.02
 
 

@@ -59,7 +59,7 @@ class PairedTest:
 
 @dataclass(frozen=True, slots=True)
 class MedianDifference:
-    """Median position errors of two results, infinite if half of the queries have no pose.
+    """Median position errors of two results; infinite if half or more queries have no pose.
 
     ``first`` and ``second`` are indices into ``Comparison.evaluations``. ``low_m`` to ``high_m`` is
     the 95 % bootstrap interval of ``first_m - second_m``, NaN for fewer than six queries.

@@ -100,7 +100,7 @@ def evaluate(
 def benchmark_beside(
     beside: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
 ) -> Benchmark:
-    """Return the benchmark of ``side_tables``, by default of the first path in a workspace."""
+    """Return the benchmark of ``side_tables``, or of the first path that is in a workspace."""
     for path in beside:
         if isinstance(path, Path | str):
             side_tables = side_tables or side_tables_near(path)
@@ -119,7 +119,7 @@ def evaluate_results(
 ) -> list[Evaluation]:
     """Evaluate several results in their order; see :func:`evaluate`.
 
-    With the pairs of an MLAD challenge, these are evaluated by MLAD's metric instead of the images.
+    If the benchmark has MLAD pairs, the relative poses of the pairs are evaluated by MLAD's metric.
     """
     if isinstance(truth, Mapping):
         true_poses: Poses = result_in_memory(truth).poses

@@ -139,7 +139,7 @@ def _facts_without_truth(reported: WithoutTruth) -> list[_Fact]:
     for _, group in groupby(reported.agreement, key=lambda row: (row.first, row.second)):
         rows = list(group)
         heading = (
-            "% of all queries where both have a pose and the two are at most "
+            "% of all queries whose poses in both results are at most "
             f"{content.bounds(reported.thresholds)} apart"
         )
         facts.append((heading, content.agreement_table(reported, rows)))
