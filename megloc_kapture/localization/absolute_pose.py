@@ -208,7 +208,7 @@ class _Projected:
     def jacobian(self, whitening: Floats) -> Floats:
         """Return the Jacobian (N, 2, 6) of whitened residuals for a left perturbation of the pose.
 
-        Rotation comes first, then translation.
+        The first three columns are for rotation, the others for translation.
         """
         by_point = _whitened(self.slopes, whitening)
         # a^T (omega x p) = omega^T (p x a)

@@ -4,8 +4,8 @@ A wrong focal length moves the camera along its axis while most matches still ag
 length is estimated again once a pose is known (Gauss-Newton on rays, Cauchy weights). A calibrated
 camera is kept; if another focal length fits far better, the pose gets a remark and a lower
 confidence. An uncertain camera (``Camera.focal_deviation``) gets the most probable intrinsics given
-a prior (EXIF, image centre, no distortion), and the pose covariance includes their uncertainty;
-pycolmap's refinement has no prior. Where the matches do not determine the intrinsics, the prior
+a prior (EXIF, image centre, no distortion), which pycolmap's refinement does not support; the pose
+covariance includes their uncertainty. Where the matches do not determine the intrinsics, the prior
 does.
 """
 
@@ -57,8 +57,8 @@ _MAX_UPDATES = 8
 # the prior is doubted if the focal length from the matches (P4Pf) differs from it by more than this
 # many standard deviations
 _MAX_DEVIATIONS = 3.0
-# a doubted prior gets the first relative deviation; a prior with less than the second comes from
-# calibration or several images and is never doubted
+# _DOUBTED_DEVIATION: relative standard deviation of a doubted prior; _MIN_DOUBTED: a prior with a
+# smaller one comes from calibration or several images, and is never doubted
 _DOUBTED_DEVIATION, _MIN_DOUBTED = 0.7, 0.1
 # prior standard deviations: principal point as a share of the longer side, radial distortion
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
@@ -179,7 +179,7 @@ def _freed(
     inliers: NDArray[np.bool_],
     max_error_px: float,
 ) -> _Freed | None:
-    """Estimate the focal length freely, other intrinsics within their calibration error.
+    """Estimate pose and focal length, and other intrinsics within their calibration error.
 
     None if the matches do not determine the focal length. Each round selects the inliers again.
     """
@@ -390,10 +390,10 @@ def _free_camera(
 ) -> tuple[Floats, RigidTransform, float, Floats] | None:
     """Fit pose and camera change to inliers' rays (N, 2) and points (N, 3) in the camera frame.
 
-    ``expected`` and ``deviations`` are the prior of ``change`` (:class:`_Fit`). ``correlated`` is
-    the factor of the matches' noise because their errors are correlated. Returns the change, the
-    motion of the points, their median depth and the covariance of motion (left perturbation) and
-    change; None if undetermined.
+    ``expected`` and ``deviations`` are the prior of ``change`` (:class:`_Fit`). ``correlated``
+    multiplies the noise of the matches, whose errors are correlated. Returns the change, the motion
+    of the points, their median depth and the covariance of motion (left perturbation) and change;
+    None if undetermined.
     """
     rotation, translation = np.eye(3), np.zeros(3)
     prior_weight = (correlated / deviations) ** 2
@@ -461,7 +461,7 @@ def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, F
 
 
 def shared_camera(cameras: Sequence[Camera]) -> Camera:
-    """Return the weighted median of each parameter; weights are inverse variances."""
+    """Combine estimates of one camera by medians of the parameters, weighted by 1 / variance."""
     weights = np.array([camera.focal_deviation**-2.0 for camera in cameras])
     params = np.array([camera.params for camera in cameras])
     order = np.argsort(params, axis=0, kind="stable")

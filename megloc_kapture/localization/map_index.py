@@ -73,7 +73,7 @@ class MapIndex:
 
     @cached_property
     def seen_once(self) -> NDArray[np.bool_]:
-        """Return a mask (N,) of points with one observation: from depth, not triangulated."""
+        """Return a mask (N,) of points with one observation: from depth, not triangulation."""
         return np.bincount(self.point_ids, minlength=len(self.xyz)) == 1
 
     def observed(self, image: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

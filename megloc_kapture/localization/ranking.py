@@ -46,8 +46,8 @@ class DistinctiveInliersOptions(Options):
     radius: float = Field(
         default=0.03,
         ge=0,
-        description="radius around an inlier within which others count as the same, as a share of "
-        "the image's longer side",
+        description="radius within which inliers of two hypotheses count as the same, as a share "
+        "of the image's longer side",
     )
     power: float = Field(
         default=4.0, gt=0, description="exponent of the sharing; 1 shares an inlier evenly"
@@ -136,8 +136,8 @@ class PerceptualOptions(Options):
         default=0.05,
         ge=0,
         le=1,
-        description="clusters with a smaller share of the largest number of inliers of any cluster "
-        "are not compared",
+        description="clusters with fewer inliers than this share of the largest number are not "
+        "compared",
     )
     min_valid: float = Field(
         default=0.15,

@@ -22,9 +22,10 @@ _NOISE_VARIANCE = 9.0  # the constant c, grey levels squared: smaller variance c
 _MIN_FILLED = 0.5  # smallest valid share of a window
 # half side of a point's patch and radius of the search for it, in pixels of the query image
 _HALF_PATCH_PX, _SEARCH_PX = 12, 6
-# limits that bound the time: number of points per view, and of map images that give patches
+# limits that bound the time: points per view, and map images from which patches are taken
 _MAX_POINTS, _MAX_IMAGES = 300, 4
-# below: standard deviation of a patch without texture; correlation of a patch that is not found
+# a patch with a smaller standard deviation has no texture; with a smaller correlation, it counts as
+# not found
 _MIN_DEVIATION, _MIN_CORRELATION = 5.0, 0.6
 # largest ratio of scales of query and map image; patches are treated as fronto-parallel planes
 _MAX_SCALE = 2.0
