@@ -181,7 +181,7 @@ def pyramid_type(local_type: str) -> str:
 
 
 def base_type(local_type: str) -> str:
-    """Return the type of the first keypoints of a pyramid type; other types as they are."""
+    """Return the keypoints type on which a pyramid type is based; other types unchanged."""
     return local_type.removesuffix(_SUFFIX)
 
 

@@ -17,7 +17,9 @@ from megloc_kapture.values import RigidTransform
 # sensors have such errors
 _MAX_ERROR_SHARE = 0.02
 _AGREEING = 0.5  # the poses of a pair are correct if this share of its matches fits them
-_MOST = 0.5  # larger shares of an image's pairs, or of the images, are most of them
+# an image is wrong if a larger share of its pairs contradicts its pose, a map is wrong if a larger
+# share of its images is wrong
+_MOST = 0.5
 _FEW = 3  # a map is rejected only if at least this many images are compared
 
 

@@ -33,7 +33,7 @@ class Combined:
     Attributes
     ----------
     matches, scores : int64 (K, 2) and float64 (K,).
-    best : index of the variant with the most matches; None if the images themselves have as many.
+    best : index of the variant with the most matches; None if it has no more than the originals.
     added : per image int64 (A, 2), indices of the variant and of its match for each appended
         keypoint.
     """

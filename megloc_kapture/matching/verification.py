@@ -36,7 +36,8 @@ _SAMPLE = 5  # matches that determine a relative pose
 _THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best result counts
 # largest expected number of false alarms; strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
-_MAX_WRONG_PAIRS = 20_000  # mismatched keypoints that give the probability of a wrong match
+# about the largest number of mismatched pairs that give the probability of a wrong match
+_MAX_WRONG_PAIRS = 20_000
 # a pair with fewer verified matches counts as not overlapping
 MIN_MATCHES = 15
 _MIN_ITERATIONS, _CONFIDENCE = 20, 0.999  # RANSAC of relative poses
@@ -109,7 +110,7 @@ def sampson_error_px(
 def in_front_of_both(rays_a: Floats, rays_b: Floats, b_from_a: RigidTransform) -> NDArray[np.bool_]:
     """Return a mask (N,) of matched rays that meet in front of both cameras or are parallel.
 
-    Rays meet where they are closest to each other.
+    Rays that do not intersect meet where they are closest to each other.
     """
     rotation = b_from_a.rotation_matrix()
     a = rays_a / np.linalg.norm(rays_a, axis=1, keepdims=True)
@@ -366,7 +367,7 @@ def agree_by_chance(
     samples = gammaln(num_matches + 1) - gammaln(num_matches - _SAMPLE + 1) - gammaln(_SAMPLE + 1)
     for share in _THRESHOLDS:
         threshold_px = share * options.max_error_px
-        # probability for uniform positions; sqrt(2): a Sampson distance has errors in both images
+        # probability for uniform positions; sqrt(2): a Sampson distance covers both images' errors
         anywhere = max(
             2 * math.sqrt(2) * threshold_px * math.hypot(c.width, c.height) / (c.width * c.height)
             for c in (camera_a, camera_b)
