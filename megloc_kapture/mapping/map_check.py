@@ -33,7 +33,7 @@ _HALF = 0.5
 _MIN_GAIN = 0.005  # a smaller relative decrease of the reprojection error is noise
 # largest median error of an image: a share of its longer side, or the second value if larger
 _MAX_SHARE, _MIN_LIMIT_PX = 0.01, 8.0
-_MAX_FAILING = 0.2  # largest share of failing images; a good map also has some wrong poses
+_MAX_FAILING = 0.2  # largest share of failing images; even a good map has some wrong poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,8 +93,8 @@ def _starts(ids: NDArray[np.integer], count: int) -> NDArray[np.int64]:
 class UncertaintyOptions(Options):
     """Limit of the points' uncertainty.
 
-    It is the largest standard deviation of a point over all directions, for a keypoint noise of
-    1 px, divided by the point's depth. Points of unknown uncertainty, which have a single
+    The uncertainty is the largest standard deviation of a point over all directions, for a keypoint
+    noise of 1 px, divided by the point's depth. Points of unknown uncertainty, which have a single
     observation and come from depth, are kept.
     """
 
@@ -167,7 +167,7 @@ def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) 
 def left_with_too_few(
     point_ids: NDArray[np.int64], dropped: Mask, num_points: int, min_observations: int
 ) -> Mask:
-    """Mark points (N,) that lost an observation and have fewer than ``min_observations`` left."""
+    """Return a mask (N,) of points that lost an observation and have too few left."""
     lost = np.bincount(point_ids[dropped], minlength=num_points)
     left = np.bincount(point_ids[~dropped], minlength=num_points)
     return (lost > 0) & (left < min_observations)
