@@ -29,7 +29,7 @@ _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
 _LATITUDE_ROUNDS = 8
 _ALIGNING_ROUNDS = 50
-_ALIGNING_PAIRS = 200  # enough: if half of the poses are correct, so are a quarter of the pairs
+_ALIGNING_PAIRS = 200  # enough: if half of the poses are correct, so is a quarter of the pairs
 # largest angle of agreeing poses; one of 30,000 random rotations agrees by chance
 _AGREEMENT_DEG = 5.0
 # largest distance of agreeing centres, as a share of the centres' median distance from their median
@@ -317,7 +317,7 @@ def _similarity(
 ) -> tuple[float, Floats, Floats]:
     """Fit ``target = scale * rotation @ source + translation``.
 
-    ``directions``, in source and target, are fitted by the rotation too.
+    The rotation also aligns ``directions`` of source and target.
     """
     from scipy.spatial.transform import Rotation
 
