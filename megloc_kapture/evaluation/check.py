@@ -186,7 +186,7 @@ def check_submission(
 
 
 def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, list[Finding]]:
-    require(not path.is_dir(), "a folder; the pose file of this challenge is one file", path=path)
+    require(not path.is_dir(), "is a folder; this challenge takes a single pose file", path=path)
     lines, poses, of_rows = _read_rows(path, "ltvl")
     world = reference.world
     findings = _check_poses(poses, reference, lambda _, pose: world.pose_in_local(pose))
@@ -309,7 +309,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
     if wrong:
         first = next(iter(wrong))
         message = (
-            f"{counted(len(wrong), 'name')} other than in the challenge's list: {first} should be "
+            f"{counted(len(wrong), 'name')} not in the challenge's list: {first} should be "
             f"{wrong[first]}"
         )
         only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())

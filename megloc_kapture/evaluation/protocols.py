@@ -42,7 +42,9 @@ PROTOCOLS = {
             dataset="robotcar",
             pose_file_stem="RobotCar",
             thresholds=_LTVL_THRESHOLDS,
-            truth=f"{_KEPT_BY_LTVL}. RobotCar Seasons v2 publishes those of its training images.",
+            truth=(
+                f"{_KEPT_BY_LTVL}. RobotCar Seasons v2 publishes the poses of its training images."
+            ),
             conditions=(*_DAY, *_NIGHT),
             pools={"day-all": _DAY, "night-all": _NIGHT},
         ),

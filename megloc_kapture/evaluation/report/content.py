@@ -161,7 +161,7 @@ def format_movement(metres: float, degrees: float) -> str:
 
 def agreement_sentence(row: AgreementRow, results: WithoutTruth) -> str:
     if not row.num_only_first and not row.num_only_second:
-        return "The same queries have a pose in both."
+        return "The same queries have a pose in both results."
     first, second = results.evaluations[row.first].label, results.evaluations[row.second].label
     return (
         f"Only {first} has a pose for {counted(row.num_only_first, 'query')}, "
