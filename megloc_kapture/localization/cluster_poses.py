@@ -377,7 +377,7 @@ def poses_of_cameras(
             moved = transform_covariance(pose.covariance, view.cam_from_rig)
             pose = replace(pose, covariance=moved)
         failure = Failure(
-            "no inlier in this camera; others of its rig were localized",
+            "no inlier in this camera; other cameras of its rig were localized",
             name=view.name,
             num_matches=len(inliers),
             candidates=rig.candidates,

@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 # independent matches are too small by this factor; _MIN_ERROR_PX: smallest assumed standard
 # deviation of a match
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
-# standard deviations from which another focal length contradicts a calibrated one
+# a focal length contradicts a calibrated one if they differ by this many standard deviations
 _MIN_SIGMAS = 3.0
 _MIN_INLIERS = 30
 _DOES_NOT_FIT = "does not fit"
@@ -72,8 +72,8 @@ _BIASED_BY = 0.1
 # a photograph whose focal length differs from the shared one by more standard deviations has
 # another zoom
 _MAX_SIGMAS = 3.0
-# factor on the deviation of the shared focal length, because errors of the map and of the lens
-# model are correlated between photographs
+# factor on the standard deviation of the shared focal length, because errors of the map and of the
+# lens model are correlated between photographs
 _ALIKE = 2.0
 
 
