@@ -165,7 +165,7 @@ class GuidedPyramidOptions(Options):
         """List the variants of an image of this size, without the identity.
 
         Scales that would enlarge the longer side beyond ``_MAX_SIDE_PX`` are replaced by the scale
-        that reaches it, unless the next smaller scale is close to that.
+        that reaches it, unless the next smaller scale is close to it.
         """
         limit = max(1.0, _MAX_SIDE_PX / max(width, height))
         scales = [scale for scale in self.scales if scale <= limit]

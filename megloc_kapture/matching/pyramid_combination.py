@@ -67,7 +67,7 @@ def combine(
             alone.take(best, tried[best])
             if len(alone.matches) > len(base_matches):
                 return alone.result(best)
-            # merging identical keypoints has removed some of its matches
+            # merging identical keypoints has removed some of the variant's matches
             for union, length in zip(keypoints, lengths, strict=True):
                 if union is not None:
                     union.truncate(length)
