@@ -152,7 +152,7 @@ def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
 
 
 def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) -> Mask:
-    """Return a mask (N,) of points to reject by their largest deviation and mean depth (N,)."""
+    """Return a mask (N,) of points to reject by largest standard deviation and mean depth (N,)."""
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         relative = deviations / depths
         usual = relative[np.isfinite(relative) & (relative > 0)]
