@@ -137,7 +137,7 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Two-sided p-value of the exact McNemar test.
+    """Return the two-sided p-value of the exact McNemar test.
 
     Null hypothesis: a query localized by only one method is equally likely localized by either.
     """
@@ -240,7 +240,7 @@ def evaluate_without_truth(
     queries: Collection[str] | None = None,
     thresholds: Sequence[Threshold] | None = None,
 ) -> WithoutTruth:
-    """Count localized queries, and compare results in one frame with each other.
+    """Count localized queries, and compare the results with each other; poses are in one frame.
 
     By default, ``queries`` are all images of the results. ``thresholds`` apply to the pose
     differences of two results.

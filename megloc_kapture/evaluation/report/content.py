@@ -42,7 +42,7 @@ FEW = 10
 _NAMES_SHOWN = 5
 _FALLBACK_POSES = {
     "retrieval": "of the best retrieved image",
-    "rig": "that another camera of the rig gives them",
+    "rig": "derived from another camera of the rig",
 }
 _MAX_WIDTH = 30
 _REASONS_SHOWN = 3

@@ -42,8 +42,8 @@ def worst_pictures(
 ) -> list[Picture]:
     """Draw queries next to the candidate with the most matches, else the nearest map image.
 
-    Images that are missing or broken are left out: a report without a picture is better than no
-    report.
+    Queries whose images are missing or broken are left out: a report without a picture is better
+    than no report.
     """
     pictures = []
     readers = _open_matches(context)
@@ -65,7 +65,7 @@ def _open_matches(context: ResultContext) -> _Readers | None:
     with contextlib.suppress(DataError):
         drawn = set(queries.types("keypoints")) & set(mapping.types("keypoints"))
         if known := [name for name in queries.types("matches") if name in drawn]:
-            # a guided pyramid includes the matches of its base type
+            # prefer a guided pyramid, which includes the matches of its base type
             chosen = min(known, key=lambda name: (base_type(name) == name, name))
             return queries.keypoints(chosen), mapping.keypoints(chosen), queries.matches(chosen)
     return None

@@ -141,7 +141,7 @@ class StoredInliers:
             return sources
         with contextlib.suppress(DataError):
             types = set(queries.types("matches"))
-            # a guided pyramid includes the matches of its base type
+            # skip the base type of a guided pyramid, which includes its matches
             types -= {base_type(name) for name in types if base_type(name) != name}
             for name in sorted(types & set(queries.types("keypoints"))):
                 index = index_map(mapping, type_in_map(mapping, name))
