@@ -122,7 +122,7 @@ def _activated(
 
 
 class Pooling(nn.Sequential):
-    """Global average pooling and projection, expanded to the size of the map."""
+    """Global average pooling and projection, expanded to the size of the feature map."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
@@ -151,7 +151,7 @@ class AtrousPyramid(nn.Module):
 
 
 class Head(nn.Module):
-    """Classifier of the pyramid at 1/4 resolution, refined by low-level features."""
+    """Classifier of pyramid and low-level features, at 1/4 resolution."""
 
     def __init__(self, channels: int, low_level_channels: int, num_classes: int) -> None:
         super().__init__()
