@@ -29,35 +29,35 @@ from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
-# error: the server refuses the file, or all its figures are wrong; warning: some poses are wrong,
-# or queries are lost; note: information
+# error: the server would reject the file or give wrong results for it; warning: some poses are
+# probably wrong or missing; note: for information
 Severity = Literal["error", "warning", "note"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-# largest number of printed findings of one kind; JSON has all
+# largest number of printed findings of one kind; the JSON lists all
 _SHOWN_OF_A_KIND = 10
 _NAMES_SHOWN = 3
 
-# the server of this dataset accepts .jpg and .png
+# the server accepts names with .jpg and with .png for this dataset
 _ANY_ENDING = "robotcar"
-# whether names contain a folder, and their endings
+# dataset -> (names contain a folder, valid endings)
 _SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
     "aachen": (False, (".jpg",)),
     "inloc": (False, (".JPG",)),
     "robotcar": (True, (".jpg", ".png")),
 }
 
-# fewer poses or cameras fit any convention by chance
+# with fewer poses or cameras, any convention may fit by chance
 _MIN_POSES = 3
-# poses compared in each convention, evenly spread over the file
+# largest number of poses compared in each convention, evenly spread over the file
 _SAMPLE = 500
-# a pose is near the map within this multiple of the median distance of the best convention, or
-# within this share of the map's extent, below which directions hardly differ
+# a pose is near the map if its distance (see _frames) is at most _NEAR times the median in the best
+# convention, or at most _LEAST times the map's extent (directions then differ by about a degree)
 _NEAR, _LEAST = 2.0, 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One problem; ``kind`` is a stable identifier (``convention``, ``missing``)."""
+    """One finding; ``kind`` is a stable identifier such as ``convention`` or ``missing``."""
 
     severity: Severity
     kind: str
@@ -73,7 +73,10 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """Result of a check, findings sorted by severity, file and line."""
+    """Result of a check.
+
+    Findings are sorted by severity, those without a line first, then by file and line.
+    """
 
     dataset: str
     file: str
@@ -87,7 +90,7 @@ class CheckReport:
         return any(finding.severity == "error" for finding in self.findings)
 
     def lines(self) -> list[str]:
-        """Format the report, one problem per line; the last line is the outcome."""
+        """Format the report, one finding per line; the last line is the outcome."""
         counts: Counter[tuple[str, str]] = Counter()
         shown = []
         for finding in self.findings:
@@ -155,7 +158,10 @@ def read_reference(folder: Path) -> Reference:
 def check_submission(
     path: Path, *, dataset: str, reference: Reference | None = None
 ) -> CheckReport:
-    """Check a pose file, or an MLAD challenge's folder, alone or against a reference."""
+    """Check a pose file, or the folder of pose files of an MLAD challenge.
+
+    Without a reference, only the format is checked.
+    """
     if reference is None:
         reference = Reference(protocol=PROTOCOLS.get(dataset, Protocol()))
     if reference.protocol.pose_file == "mlad":
@@ -180,7 +186,7 @@ def check_submission(
 
 
 def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, list[Finding]]:
-    require(not path.is_dir(), "a folder; the pose file of this challenge is one file", path=path)
+    require(not path.is_dir(), "is a folder; this challenge takes a single pose file", path=path)
     lines, poses, of_rows = _read_rows(path, "ltvl")
     world = reference.world
     findings = _check_poses(poses, reference, lambda _, pose: world.pose_in_local(pose))
@@ -223,7 +229,10 @@ def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
 def _read_rows(
     path: Path, kind: PoseFileFormat
 ) -> tuple[dict[str, int], dict[str, RigidTransform], list[Finding]]:
-    """Return line numbers and valid poses by name, or by two timestamps, and wrong rows."""
+    """Return line numbers and valid poses, and a finding for each wrong row.
+
+    Both dictionaries are keyed by name, or by the two timestamps of an MLAD row.
+    """
     text = read_text(path)
     require(
         not pose_files.is_colmap_images(text),
@@ -300,7 +309,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
     if wrong:
         first = next(iter(wrong))
         message = (
-            f"{counted(len(wrong), 'name')} other than in the challenge's list: {first} should be "
+            f"{counted(len(wrong), 'name')} not in the challenge's list: {first} should be "
             f"{wrong[first]}"
         )
         only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())
@@ -352,19 +361,19 @@ def _check_pairs(
         for key in unknown
     ]
     if missing := [key for key in wanted if key not in lines]:
-        what = f"of {len(wanted)} without a row, which every pair needs"
+        what = f"of {len(wanted)} without a row (every pair needs one)"
         findings.append(_about("error", "missing", missing, "pair", what))
-    # the identity fills in for a missing pose, and fits no convention
+    # the identity is a placeholder for a missing pose, so it is not compared with the map
     identity = RigidTransform.identity()
     if dummies := [key for key, pose in read.items() if pose == identity]:
         findings.append(
-            _about("note", "dummies", dummies, "row", "with the identity, a placeholder")
+            _about("note", "dummies", dummies, "row", "with the identity as a placeholder")
         )
     map_poses, scale = reference.map_poses, reference.world.official_from_local.scale
     poses = {
         key: pose for key, pose in read.items() if pose != identity and wanted.get(key) in map_poses
     }
-    if scale == 1.0:  # poses are not compared with a map in other units
+    if scale == 1.0:  # otherwise the poses and the map have different units
         in_local = lambda key, pose: pose @ map_poses[wanted[key]]  # noqa: E731
         findings += _check_poses(poses, reference, in_local)
     return findings
@@ -393,13 +402,13 @@ def _check_poses(
     if better := better_conventions(shares):
         message = (
             f"{' or '.join(better)}: with this convention, {max(shares):.0%} of the poses are near "
-            f"the map's cameras, as given {shares[0]:.0%}; the format has cam_from_world with x "
-            "right, y down, z forward"
+            f"the map's cameras, but only {shares[0]:.0%} as they are in the file; the format has "
+            "cam_from_world with x right, y down, z forward"
         )
         return [Finding("error", "convention", message)]
     centers = _centers([in_local(name, pose) for name, pose in poses.items()])
     distance = cKDTree(_centers(map_poses)).query(centers)[0]
-    # queries may all be taken at some distance from the map
+    # all queries may have been taken at some distance from the map's cameras
     limit = max(extent, min(4 * float(np.median(distance)), 3 * extent))
     order = np.argsort(-distance, kind="stable")
     far = order[distance[order] > limit].tolist()
@@ -424,7 +433,8 @@ def _centers(poses: Sequence[RigidTransform]) -> NDArray[np.float64]:
 def _frames(poses: Sequence[RigidTransform], length: float) -> NDArray[np.float64]:
     """Return the centre and the ends of the x and z axes of each camera, (N, 9).
 
-    Their distances grow with the distance and the angle of two cameras.
+    The distance between two rows grows with the distance and with the angle of the two cameras.
+    ``length`` is that of the axes.
     """
     centers = _centers(poses)
     axes = length * rotation_matrices(stack_poses(poses)[0])  # rows: camera's x, y, z in the world

@@ -34,11 +34,12 @@ MIN_RESAMPLED = 6
 
 @dataclass(frozen=True, slots=True)
 class PairedTest:
-    """Exact McNemar test of two results, by position, at one threshold.
+    """Exact McNemar test of two results at one threshold.
 
-    ``only_first`` and ``only_second`` are the queries within the threshold in one result only;
-    ``both`` and ``neither`` count the others. ``p_adjusted`` has Holm's correction for all tests of
-    the comparison.
+    ``first`` and ``second`` are indices into ``Comparison.evaluations``. ``only_first`` and
+    ``only_second`` are the queries within the threshold in one result only; ``both`` and
+    ``neither`` count the other queries. ``p_adjusted`` is the p-value after Holm's correction for
+    all tests of the comparison.
     """
 
     first: int
@@ -58,10 +59,10 @@ class PairedTest:
 
 @dataclass(frozen=True, slots=True)
 class MedianDifference:
-    """Median position errors of two results, by position; infinite if most queries have no pose.
+    """Median position errors of two results; infinite if half or more queries have no pose.
 
-    ``low_m`` to ``high_m`` is the 95 % interval of ``first_m - second_m`` from resampling the
-    queries; NaN for fewer than six.
+    ``first`` and ``second`` are indices into ``Comparison.evaluations``. ``low_m`` to ``high_m`` is
+    the 95 % bootstrap interval of ``first_m - second_m``, NaN for fewer than six queries.
     """
 
     first: int
@@ -136,7 +137,7 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Two-sided p-value of the exact McNemar test.
+    """Return the two-sided p-value of the exact McNemar test.
 
     Null hypothesis: a query localized by only one method is equally likely localized by either.
     """
@@ -147,7 +148,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
-    """Adjust p-values (N,) by Holm's method for the chance of any false alarm among N tests."""
+    """Adjust p-values (N,) by Holm's method, which bounds the chance of any false positive."""
     p = np.asarray(p_values, dtype=np.float64)
     order = np.argsort(p, kind="stable")
     adjusted = np.empty_like(p)
@@ -157,7 +158,7 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 
 
 def _resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return medians (2000,) of resampled values (N,), which may be infinite.
+    """Return medians (2000,) of bootstrap samples of values (N,), which may be infinite.
 
     The draws depend on N only, so medians of results on the same queries are paired.
     """
@@ -188,10 +189,12 @@ Quartiles = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class AgreementRow:
-    """Agreement of the results at positions ``first`` and ``second`` in one row of the table.
+    """Agreement of two results in one row of the table.
 
-    ``within`` counts queries whose two poses differ by no more than a threshold, as a share of all
-    queries; the medians of the differences are over queries with a pose in both.
+    ``first`` and ``second`` are indices into ``WithoutTruth.evaluations``. ``within`` has, per
+    threshold, the share of all queries whose two poses differ by at most the threshold.
+    ``median_m`` and ``median_deg`` are medians of the pose differences over the queries with a pose
+    in both results.
     """
 
     first: int
@@ -210,8 +213,9 @@ class AgreementRow:
 class WithoutTruth(Reported):
     """Results without true poses.
 
-    ``statement`` names the owner of the true poses. ``agreement`` and ``apart`` compare pairs of
-    results; ``apart`` has their pose differences, infinite if a pose is missing.
+    ``statement`` explains why there are no true poses. ``agreement`` has one row per pair of
+    results and condition. ``apart`` has the pose differences of each pair of results, infinite if
+    one of the poses is missing.
     """
 
     statement: str
@@ -236,7 +240,7 @@ def evaluate_without_truth(
     queries: Collection[str] | None = None,
     thresholds: Sequence[Threshold] | None = None,
 ) -> WithoutTruth:
-    """Count localized queries, and compare results in one frame with each other.
+    """Count localized queries, and compare the results with each other; poses are in one frame.
 
     By default, ``queries`` are all images of the results. ``thresholds`` apply to the pose
     differences of two results.
@@ -288,7 +292,7 @@ def _counted(
     members: Mapping[str, NDArray[np.bool_]],
 ) -> Evaluation:
     queries = tuple(query_result(result, i, conditions, (math.nan, math.nan)) for i in images)
-    # rows count poses; without thresholds nothing depends on the errors
+    # the result is compared with itself: rows only count its poses, thresholds are empty
     errors = pose_errors(result.poses, result.poses, images)
     return Evaluation(
         label=result.label,

@@ -42,8 +42,10 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 _log = logging.getLogger(__name__)
 
 Align = Literal["none", "se3", "sim3"]
-# a similarity fits two centres by construction
+# a similarity transform always fits two camera centres exactly, so two poses that agree prove
+# nothing
 _MIN_AGREEING = 4
+# largest number of poses for the note that an alignment would fit
 _MOST_COMPARED = 500
 
 Localized = Path | str | Mapping[str, Pose | Failure] | Mapping[str, RigidTransform]
@@ -69,13 +71,15 @@ def evaluate(
     Parameters
     ----------
     estimated, truth : kapture folder, pose file, COLMAP model, or image -> ``cam_from_world`` in
-        metres. A folder of results may have a ``status.csv``, a folder of true poses a
-        ``nowhere.txt``: one query per line that does not show the map, so that no pose is correct.
+        metres. A folder of results may have a ``status.csv``. A folder of true poses may have a
+        ``nowhere.txt``, one query per line: images that do not show the map, for which no pose is
+        correct.
     dataset : name of the dataset whose thresholds, conditions and pools apply; by default those of
         the side tables.
-    side_tables : ``megloc/`` folder of the workspace, by default found near truth or result.
+    side_tables : ``megloc/`` folder of a workspace; by default that of the workspace of ``truth``,
+        else of ``estimated``.
     thresholds : recall thresholds instead of the protocol's.
-    mapping : kapture folder of the map, for MLAD's pairs and for pictures; by default found in the
+    mapping : kapture folder of the map, for MLAD's pairs and for pictures; by default that of the
         workspace of ``estimated``.
     label : name of the result in tables; by default its path.
     align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
@@ -96,7 +100,7 @@ def evaluate(
 def benchmark_beside(
     beside: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
 ) -> Benchmark:
-    """Return the benchmark of side tables, by default of the first workspace of the paths."""
+    """Return the benchmark of ``side_tables``, or of the first path that is in a workspace."""
     for path in beside:
         if isinstance(path, Path | str):
             side_tables = side_tables or side_tables_near(path)
@@ -115,7 +119,7 @@ def evaluate_results(
 ) -> list[Evaluation]:
     """Evaluate several results in their order; see :func:`evaluate`.
 
-    A benchmark with MLAD pairs is evaluated by MLAD's metric on these.
+    If the benchmark has MLAD pairs, the relative poses of the pairs are evaluated by MLAD's metric.
     """
     if isinstance(truth, Mapping):
         true_poses: Poses = result_in_memory(truth).poses
@@ -163,7 +167,8 @@ def results_without_truth(
 ) -> WithoutTruth:
     """Evaluate results without true poses; see :func:`evaluate`.
 
-    The queries are those of the challenge's list, else those of the results and workspaces.
+    The queries are those of the challenge's list or pairs, else the scored images of the results
+    and of their workspaces.
     """
     contexts = [_context(source, mapping) for source in results]
     if len(contexts) > 1:
@@ -201,7 +206,7 @@ def _read(
 def _by_names_of_results(
     true_poses: Poses, results: Sequence[Result], known: Collection[str]
 ) -> Poses:
-    """Rename the true poses if the results have the images in other folders."""
+    """Rename the true poses if results and truth have no image name in common (other folders)."""
     images = {image for result in results for image in result.images}
     if not images & true_poses.keys():
         true_poses = poses_by_image(true_poses, images)
@@ -220,7 +225,8 @@ def _in_local_frame(
 ) -> Poses:
     """Transform true poses from the official to the local frame, if necessary.
 
-    They are in the official frame if they then fit the results a thousand times better.
+    They are taken to be in the official frame if the transform brings the true camera centres a
+    thousand times closer to the estimated ones.
     """
     pairs = [
         (true_poses[i], pose) for r in results for i, pose in r.poses.items() if i in true_poses
@@ -263,7 +269,7 @@ def _warn_of_unit(contexts: Sequence[ResultContext]) -> None:
 def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, str]:
     """Return the result, aligned if requested, and a note on the alignment (may be empty)."""
     images = sorted(result.poses.keys() & true_poses.keys())
-    if align == "none":  # enough for a note; time grows with the square of their number
+    if align == "none":  # a sample is enough for a note; time grows with the square of its size
         images = images[:: -(-len(images) // _MOST_COMPARED) or 1]
     estimated = stack_poses(result.poses[image] for image in images)
     true = stack_poses(true_poses[image] for image in images)

@@ -5,9 +5,9 @@ visuallocalization.net (LTVL) takes one line ``name qw qx qy qz tx ty tz`` per q
 A query without a pose has no line.
 
 The MLAD challenges (4Seasons) take ``src_ts tgt_ts tx ty tz qx qy qz qw`` per pair: the pose is
-``query_from_reference`` of the rectified left cameras. A file has the name and
-all pairs of its relocalization file, which has the same rows, with poses for training recordings
-only.
+``query_from_reference`` of the rectified left cameras. A pose file has the name and all pairs of
+its relocalization file. Relocalization files of training recordings have the same columns; the
+others have the timestamps only.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ def name_by_rule(image: str, rule: PoseFileNames) -> str:
 
 
 def is_name(text: str) -> bool:
-    """Return whether a row can begin with ``text``: not empty, no white space."""
+    """Return whether ``text`` can be a name in a pose file: not empty, no white space."""
     return text.split() == [text]
 
 
 def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
-    """Return image -> name in the order of the pose file: by name, or the list's order.
+    """Return image -> name, sorted by name or in the order of the challenge's list.
 
     Images that are not in the challenge's list are left out.
     """
@@ -86,7 +86,7 @@ def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
 
 
 def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
-    """Return the text of a pose file; numbers read back to the same float64."""
+    """Return the text of a pose file; reading it gives exactly the same float64 numbers."""
     lines = []
     for image, name in names_in_pose_file(poses, names).items():
         pose = checked_pose(poses[image].quat_wxyz, poses[image].translation, f"image {image!r}")
@@ -100,10 +100,10 @@ def write_pose_file(path: Path | str, poses: Poses, *, names: Names = "full") ->
 
 
 def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
-    """Read name -> ``cam_from_world`` from a pose file or COLMAP's ``images.txt``, in its order.
+    """Read name -> ``cam_from_world`` from a pose file or COLMAP's ``images.txt``, in file order.
 
-    Rows of nan or with a zero quaternion, which other tools write for failed queries, are left
-    out with a warning. Tabs, CRLF, empty lines and comments are accepted.
+    Rows with a number that is not finite or with a zero quaternion, which other tools write for
+    failed queries, are left out with a warning. Tabs, CRLF, empty lines and comments are accepted.
     """
     text = read_text(path)
     rows = (_colmap_rows if is_colmap_images(text) else _rows)(text)
@@ -150,7 +150,7 @@ def poses_by_image(
 
     A name is looked up in this order: in the challenge's list ``names`` (image -> name), as an
     image, as the end of one image's path, as a path that ends with an image, and with another
-    suffix (servers accept ``.jpg`` for ``.png``). Other names are kept and reported later.
+    suffix (servers accept ``.jpg`` for ``.png``). Names that fit no image are kept.
     """
     known = set(images)
     listed = {name: image for image, name in (names or {}).items()}
@@ -203,7 +203,7 @@ def checked_pose(
     translation: tuple[float, float, float],
     whose: str,
 ) -> RigidTransform:
-    # larger squares overflow
+    # the squares of larger numbers may overflow
     require(
         all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)), f"{whose}: the pose is not finite"
     )
@@ -227,13 +227,13 @@ def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> Rigid
 
 
 MLAD_COLUMNS = "src_ts tgt_ts tx ty tz qx qy qz qw"
-# no leading zero, so that an int is written back as it was
+# without leading zeros, so that writing the parsed int gives the same text
 _TIMESTAMP = re.compile("0|[1-9][0-9]{0,29}")
 
 
 @dataclass(frozen=True, slots=True)
 class RelativePose:
-    """One row: the timestamps of two keyframes, and their pose if the row has one."""
+    """One row: the timestamps of two keyframes, and their relative pose if the row has one."""
 
     reference: int
     query: int
@@ -261,7 +261,7 @@ def scaled_pose(pose: RigidTransform, scale: float) -> RigidTransform:
 
 
 def format_mlad_file(rows: Iterable[RelativePose]) -> str:
-    """Return the text of a pose file; numbers read back to the same float64."""
+    """Return the text of a pose file; reading it gives exactly the same float64 numbers."""
     lines = []
     for row in rows:
         pair = f"{row.reference} {row.query}"
@@ -275,7 +275,7 @@ def format_mlad_file(rows: Iterable[RelativePose]) -> str:
 
 
 def read_mlad_file(path: Path | str) -> list[RelativePose]:
-    """Read a pose file or a relocalization file in its order."""
+    """Read a pose file or a relocalization file, in file order."""
     rows: list[RelativePose] = []
     pairs: set[tuple[int, int]] = set()
     columns = 0
@@ -303,7 +303,7 @@ def parse_timestamp(text: str) -> int:
     return int(text)
 
 
-# packages that can change a pose or a figure of the report
+# packages whose version can change a pose or a number in a report
 PACKAGES = (
     "megloc-kapture",
     "numpy",
@@ -316,7 +316,7 @@ PACKAGES = (
 )
 
 
-@cache  # parsing a package's metadata takes 2 ms, and every stage writes nine
+@cache  # parsing a package's metadata takes 2 ms, and every stage writes all versions
 def installed_version(package: str) -> str | None:
     try:
         return metadata.version(package)
@@ -342,7 +342,7 @@ def write_provenance(
     counts: Mapping[str, int],
     files: Sequence[str] | None = None,
 ) -> Path:
-    """Write the provenance of a pose file, or of the ``files`` of a folder, and return its path.
+    """Write the provenance of a pose file, or of ``files`` in a folder; return the JSON's path.
 
     The JSON has the SHA-256 of each file, package versions, ``counts`` and the entries of
     ``provenance`` (options, preset, inputs), but no date: the same run gives the same bytes.
@@ -371,7 +371,8 @@ class _Provenance(BaseModel):
 def read_confidences(target: Path | str) -> dict[str, float]:
     """Read image -> confidence from the JSON file of a pose file.
 
-    Empty, with a warning, if another program wrote the JSON or it belongs to another pose file.
+    Empty if the JSON file is missing; also, with a warning, if it does not have the expected
+    content or belongs to another pose file.
     """
     target, path = Path(target), provenance_path(target)
     if not path.is_file():

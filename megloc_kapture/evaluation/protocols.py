@@ -42,7 +42,9 @@ PROTOCOLS = {
             dataset="robotcar",
             pose_file_stem="RobotCar",
             thresholds=_LTVL_THRESHOLDS,
-            truth=f"{_KEPT_BY_LTVL}. RobotCar Seasons v2 publishes those of its training images.",
+            truth=(
+                f"{_KEPT_BY_LTVL}. RobotCar Seasons v2 publishes the poses of its training images."
+            ),
             conditions=(*_DAY, *_NIGHT),
             pools={"day-all": _DAY, "night-all": _NIGHT},
         ),
@@ -88,8 +90,9 @@ _DEFAULT_GROUP = ImageGroup()
 class Benchmark:
     """The rules of a benchmark.
 
-    ``world`` relates the local frame of the truth to the official frame of pose files; ``names`` is
-    the challenge's list, image -> name in a pose file; ``pairs`` are those of an MLAD challenge.
+    ``world`` transforms between the local frame, that of the map and the true poses, and the
+    official frame of pose files. ``names`` is the challenge's list, image -> name in a pose file;
+    ``pairs`` are the image pairs of an MLAD challenge.
     """
 
     protocol: Protocol = Protocol()
@@ -119,7 +122,7 @@ class Benchmark:
 def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = None) -> Benchmark:
     """Return the benchmark of a workspace's ``megloc/`` folder, of a dataset, or the default.
 
-    A dataset overrides the protocol of the workspace, but not its groups and frame.
+    A dataset overrides the protocol of the workspace, but not its groups, frame, names and pairs.
     """
     named = None if dataset is None else protocol_of(dataset)
     if side_tables is None:

@@ -1,7 +1,7 @@
-"""The 3D view of a map and of queries in it: one self-contained HTML page, drawn by WebGL2.
+"""The 3D view of a map and of queries in it: one self-contained HTML page, drawn with WebGL 2.
 
-Coordinates are float32 relative to an origin in full precision. A page that would be large shows a
-part of the data, with a note.
+Coordinates are float32 relative to an origin in full precision. Large maps and results are shown in
+part, with a note on the page.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
-# largest number of drawn inliers, of all queries and of one
+# largest number of drawn inliers, in total and per query
 _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
 # reading the inliers of a query takes 20 ms or more
 _MAX_QUERIES_WITH_INLIERS = 300
-_MAX_FRAMES = 255
+_MAX_FRAMES = 255  # indices are uint8
 _MAX_COLOR_IMAGES = 150
 _SEED = 0
 # tan(80 degrees): wider frusta hide everything
@@ -70,11 +70,12 @@ class Scene:
     ----------
     origin : float64 (3,), subtracted from all coordinates.
     points, colors : (P, 3), points of the map.
-    camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of map cameras, estimates and truths: the
-        centre, then rays at depth 1 through the upper left, upper right, lower right and lower left
-        corner of the image; NaN without a pose.
+    camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of the map cameras, estimated poses and
+        true poses: the centre, then rays at depth 1 through the upper left, upper right, lower
+        right and lower left corner of the image; NaN without a pose.
     queries : worst first.
-    inliers : float32 (K, 3), ``num_inliers`` of each query in turn.
+    inliers : float32 (K, 3), the drawn inliers of all queries; ``num_inliers`` counts them per
+        query.
     radius : radius of the visible content around the origin.
     frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
         and ``query_frames`` are indices into them.
@@ -112,9 +113,9 @@ def write_view(
 ) -> str:
     """Write a self-contained 3D page of a map and of the queries of a result.
 
-    Another view at ``path`` is overwritten, other files only with ``force``. ``result`` and
-    ``truth`` are as in :func:`megloc_kapture.evaluation.evaluate.evaluate`: queries are coloured by
-    their error, or by their confidence without truth. Returns sentences about omissions.
+    An existing view at ``path`` is overwritten, another file only with ``force``. ``result`` and
+    ``truth`` are as in :func:`megloc_kapture.evaluation.evaluate.evaluate`. Queries are coloured by
+    their error, or by their confidence if there is no truth. Returns sentences about omitted data.
     """
     path = Path(path)
     _check_output(path, force=force)
@@ -161,7 +162,7 @@ def _check_output(path: Path, *, force: bool) -> None:
 def scene_of(
     title: str, stored: StoredInliers, queries: Sequence[QueryResult] = ()
 ) -> Scene | None:
-    """Return the scene of a map and of queries, worst first; None if no camera has a pose."""
+    """Return the scene of a map and of ranked queries; None if no camera has a pose."""
     context, notes = stored.context, list[str]()
     rng = np.random.default_rng(_SEED)
     mapping = context.mapping
@@ -192,10 +193,10 @@ def scene_of(
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
     page, _ = top_view(quats, centers)
-    # separately, so that ten cameras count next to a thousand points
+    # cameras and points separately, so that ten cameras count next to a thousand points
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
-    # few digits, so that JSON has the exact origin
+    # rounded, so that the JSON has the exact origin
     origin = np.round((low + high) / 2, 3)
     rays = _rays(context.queries, [query.image for query in queries], context.cameras)
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
@@ -342,7 +343,7 @@ def _colors(
     mapping: KaptureFolder | None,
     rows: NDArray[np.int64],
 ) -> NDArray[np.uint8]:
-    """Return colours (P, 3) of the map, of its images, or greys that grow lighter upwards.
+    """Return colours (P, 3): the map's, else those of its images, else lighter with height.
 
     ``rows`` are the indices of the points in the map.
     """

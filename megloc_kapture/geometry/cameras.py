@@ -19,11 +19,11 @@ from megloc_kapture.values import (
 )
 
 PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
-# models whose first distortion parameter multiplies the squared radius
+# models whose first distortion parameter is the coefficient of the squared radius
 RADIAL_MODELS = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 
 
-# models with two focal lengths whose distortion parameters begin with those of the key
+# model with one focal length -> model with two whose distortion parameters begin with the same ones
 _TWO_FOCAL_MODEL = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
@@ -64,7 +64,7 @@ def scale_focal(camera: Camera, factor: float) -> Camera:
 
 
 def radial_distortion(camera: Camera) -> float:
-    """Return the distortion parameter of the squared radius; the model is in RADIAL_MODELS."""
+    """Return the coefficient of the squared radius; the model must be in RADIAL_MODELS."""
     return camera.params[_principal_point_index(camera) + 2]
 
 
@@ -91,7 +91,7 @@ def same_lens(first: Camera, second: Camera) -> bool:
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """Scale a camera; sides are rounded to whole pixels, and parameters follow rounded sides."""
+    """Scale a camera to sides of whole pixels; parameters are scaled by the rounded sides."""
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     x, y = width / camera.width, height / camera.height
     params = list(camera.params)

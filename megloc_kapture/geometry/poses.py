@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 GeoPosition = tuple[float, float, float]
 """Latitude and longitude in degrees, height in metres above the ellipsoid."""
 
-# standard deviation over median magnitude of normal values: 1 / (quantile of 3/4)
+# standard deviation of normally distributed values over their median magnitude: 1 / (3/4 quantile)
 _DEVIATION_OF_MEDIAN = 1.482602218505602
 # WGS84 ellipsoid
 _SEMI_MAJOR_M = 6378137.0
@@ -29,14 +29,16 @@ _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
 _LATITUDE_ROUNDS = 8
 _ALIGNING_ROUNDS = 50
-_ALIGNING_PAIRS = 200  # if half of the poses are right, a quarter of the pairs is
+_ALIGNING_PAIRS = 200  # enough: if half of the poses are correct, so is a quarter of the pairs
 # largest angle of agreeing poses; one of 30,000 random rotations agrees by chance
 _AGREEMENT_DEG = 5.0
 # largest distance of agreeing centres, as a share of the centres' median distance from their median
 _AGREEMENT_OF_SPREAD = 0.1
-# scale and axes need this spread of the positions in two directions, in residuals
+# smallest spread of the positions in the second direction, in residuals, that determines the scale
+# and the axes
 _MIN_SPREAD = 3.0
-# phone receivers claim no better; residuals of three positions may be smaller by chance
+# smallest assumed error of GPS positions: phone receivers claim no better, and the residuals of
+# three positions may be smaller by chance
 _MIN_RESIDUAL_M = 1.0
 
 
@@ -106,7 +108,7 @@ def rotate(quats_wxyz: Floats, vectors: Floats) -> Floats:
 def compose(
     quats_ab: Floats, translations_ab: Floats, quats_bc: Floats, translations_bc: Floats
 ) -> tuple[Floats, Floats]:
-    """Compose ``a_from_b`` and ``b_from_c``; the result's quaternions (..., 4) are normalised."""
+    """Compose ``a_from_b`` and ``b_from_c`` to ``a_from_c`` with unit quaternions (..., 4)."""
     quats = normalize_quats(multiply_quats(quats_ab, quats_bc))
     return quats, rotate(quats_ab, translations_bc) + translations_ab
 
@@ -193,7 +195,7 @@ def geodetic(ecef_m: Floats) -> tuple[float, float, float]:
 class EarthAlignment:
     """The position of a map on earth: ``enu = enu_from_map(scale * x)``, ENU axes at ``origin``.
 
-    ``residual_m`` is the median distance of the aligned camera centres from their positions.
+    ``residual_m`` is the median distance of the aligned camera centres from their GPS positions.
     """
 
     scale: float
@@ -243,7 +245,7 @@ def align_to_earth(
 class PoseAlignment:
     """Similarity between two estimates of the same cameras: ``target = R(scale * source) + t``.
 
-    ``agrees`` and ``agreed_before`` (N,) mark the poses that agree with and without it.
+    ``agrees`` and ``agreed_before`` (N,) mark the poses that agree with and without the similarity.
     """
 
     scale: float
@@ -257,8 +259,8 @@ def align_poses(
 ) -> PoseAlignment:
     """Align ``cam_from_source`` with ``cam_from_target``: quaternions (N, 4), translations (N, 3).
 
-    A similarity (or rigid transform) is fitted to pairs of poses; the one with the most inliers is
-    refitted to its inliers.
+    A similarity (or rigid transform) is fitted to each of many pairs of poses. The transform with
+    the most inliers is refitted to its inliers.
     """
     number = len(source[0])
     if number < 3:
@@ -313,7 +315,10 @@ def _similarity(
     weights: Floats,
     directions: tuple[Floats, ...] = (np.zeros((0, 3)), np.zeros((0, 3))),
 ) -> tuple[float, Floats, Floats]:
-    """Fit ``target = scale * rotation @ source + translation``; ``directions`` fit the rotation."""
+    """Fit ``target = scale * rotation @ source + translation``.
+
+    The rotation also aligns ``directions`` of source and target.
+    """
     from scipy.spatial.transform import Rotation
 
     means = [np.average(points, axis=0, weights=weights) for points in (source, target)]
@@ -344,9 +349,9 @@ def perturbed(cam_from_world: RigidTransform, step: NDArray[np.float64]) -> Rigi
 
 
 _COLMAP_FROM_OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-# a convention needs this share of explained data, and this gain over the poses as given
+# a convention must explain this share of the data, and this much more than the poses as given
 _MIN_SHARE, _MIN_GAIN = 0.4, 0.25
-_TIE = 0.05
+_TIE = 0.05  # conventions within this share of the best are named too
 
 
 def _quaternion_last(pose: RigidTransform) -> RigidTransform:
@@ -368,7 +373,7 @@ CONVENTIONS: Mapping[str, Callable[[RigidTransform], RigidTransform]] = {
     "translations read as camera centres": _center_given,
     "quaternions read as x, y, z, w": _quaternion_last,
 }
-"""Functions, by the name of each convention, that convert a pose given in it to COLMAP's."""
+"""Name of a convention -> function that converts a pose given in it to COLMAP's convention."""
 
 
 def better_conventions(shares: Sequence[float]) -> list[str]:

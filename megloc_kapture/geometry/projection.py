@@ -27,7 +27,7 @@ _OPENCV, _FULL_OPENCV, _FOV = _NUMBERS["OPENCV"], _NUMBERS["FULL_OPENCV"], _NUMB
 _THIN_PRISM_FISHEYE = _NUMBERS["THIN_PRISM_FISHEYE"]
 
 _FOV_EPSILON = 1e-4  # COLMAP's
-# below this radius the series of the angle has double precision
+# below this radius the series expansion of the angle has double precision
 _NEAR_AXIS = 1e-3
 # a pixel centre on an edge belongs to both triangles despite rounding
 _ON_EDGE = 1e-6
@@ -75,7 +75,7 @@ def project_with_jacobian(
 
 @compiled_loop
 def _angle(r):
-    """Return ``atan(r) / r`` and its derivative by r, divided by r."""
+    """Return ``atan(r) / r`` and its derivative with respect to r, divided by r."""
     if r < _NEAR_AXIS:
         r2 = r * r
         return 1.0 - r2 / 3.0 + r2 * r2 / 5.0, -2.0 / 3.0 + 0.8 * r2
@@ -85,7 +85,10 @@ def _angle(r):
 
 @compiled_loop
 def _radial_factor(model, p, r):
-    """Return the factor of (u, v) in radially symmetric models and its derivative by r over r."""
+    """Return the factor of (u, v) in radially symmetric models.
+
+    Also return its derivative with respect to r, divided by r.
+    """
     r2 = r * r
     if model in (_SIMPLE_RADIAL, _RADIAL):
         return 1.0 + r2 * (p[4] + r2 * p[5]), 2.0 * p[4] + 4.0 * p[5] * r2
@@ -115,7 +118,7 @@ def _radial_factor(model, p, r):
 
 @compiled_loop
 def _not_radial(model, p, u, v):
-    """Return distorted (x, y) of models without radial symmetry, and the four derivatives."""
+    """Return distorted (x, y) in models without radial symmetry, and the four derivatives."""
     u2, v2, uv = u * u, v * v, u * v
     r2 = u2 + v2
     if model == _OPENCV:
@@ -129,13 +132,13 @@ def _not_radial(model, p, u, v):
         radial = above / below
         slope = (above_slope - radial * below_slope) / below
         p1, p2, s1, s2 = p[6], p[7], 0.0, 0.0
-    else:  # the thin prism, of angles
+    else:  # THIN_PRISM_FISHEYE, where u and v are angles
         radial = 1.0 + r2 * (p[4] + r2 * (p[5] + r2 * (p[8] + r2 * p[9])))
         slope = p[4] + r2 * (2.0 * p[5] + r2 * (3.0 * p[8] + r2 * 4.0 * p[9]))
         p1, p2, s1, s2 = p[6], p[7], p[10], p[11]
     x = u * radial + 2.0 * p1 * uv + p2 * (r2 + 2.0 * u2) + s1 * r2
     y = v * radial + 2.0 * p2 * uv + p1 * (r2 + 2.0 * v2) + s2 * r2
-    # slope is the derivative by r^2, whose derivatives are 2u and 2v
+    # slope is the derivative with respect to r^2, whose derivatives are 2u and 2v
     cross = 2.0 * uv * slope
     xu = radial + 2.0 * u2 * slope + 2.0 * p1 * v + 6.0 * p2 * u + 2.0 * s1 * u
     xv = cross + 2.0 * p1 * u + 2.0 * p2 * v + 2.0 * s1 * v
@@ -146,10 +149,10 @@ def _not_radial(model, p, u, v):
 
 @compiled_loop
 def distorted(model, p, u, v):
-    """Distort normalised coordinates ``u = x / z``, ``v = y / z`` to a, b; return the derivatives.
+    """Distort normalised coordinates ``u = x / z``, ``v = y / z`` to a, b.
 
-    They are those of a by u and v, then of b by u and v; the pixel is ``(p[0] a + p[2], p[1] b +
-    p[3])``. ``model`` and ``p`` are :func:`model_id` and :func:`packed_params`.
+    Returns a, b, da/du, da/dv, db/du, db/dv; the pixel is ``(p[0] a + p[2], p[1] b + p[3])``.
+    ``model`` and ``p`` are :func:`model_id` and :func:`packed_params`.
     """
     if model <= PINHOLES:
         return u, v, 1.0, 0.0, 0.0, 1.0
@@ -167,7 +170,7 @@ def distorted(model, p, u, v):
 
 @compiled_loop
 def project_point(model, p, x, y, z, out):
-    """Write px, py and their derivatives by x, y, z to ``out`` (8,); NaN behind the camera.
+    """Write pixel x, y and their derivatives to ``out`` (8,); NaN behind the camera.
 
     ``model`` and ``p`` are :func:`model_id` and :func:`packed_params`.
     """
@@ -220,9 +223,10 @@ def draw_depth_surface(
     Parameters
     ----------
     depth_m : float32 (R, C); 0, negative or not finite where unknown.
-    rays : (R * C, 3) through its pixel centres, z = 1, in the depth camera's frame.
+    rays : (R * C, 3) through the pixel centres of the depth map, z = 1, in its camera's frame.
     max_jump : largest difference between neighbouring depths, as a share of the nearer.
-    near_m, field : smallest depth in the view, and largest tangent of the angle off its axis.
+    near_m : smallest depth in the view.
+    field : largest tangent of the angle between a ray and the optical axis of the view.
     """
     rows, columns = depth_m.shape
     depth = np.ascontiguousarray(depth_m, np.float64)
@@ -303,7 +307,7 @@ def _draw(depth, px, z, max_jump, inverse, front):
             visible[r, c] = math.isfinite(px[r, c, 0] + px[r, c, 1])
     for r in range(rows - 1):
         for c in range(columns - 1):
-            # use the quad's other diagonal where this one crosses an edge or a hole
+            # divide the quad by its other diagonal where this one crosses a depth edge or a hole
             falling = abs(depth[r, c] - depth[r + 1, c + 1])
             rising = abs(depth[r, c + 1] - depth[r + 1, c])
             whole = visible[r, c] and visible[r + 1, c + 1]

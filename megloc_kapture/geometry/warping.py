@@ -1,7 +1,7 @@
 """Warping of reference images with depth into another view, with a z-buffer.
 
 Each reference's depth map is drawn as a surface into the view. Every pixel then takes the colour of
-the nearest surface, bilinearly, from the references that see it.
+the nearest surface from one of the references that see it, by bilinear interpolation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from megloc_kapture.geometry.cameras import (
 )
 from megloc_kapture.values import Camera, RigidTransform
 
-_NEAR_M = 0.02  # surfaces nearer to the view are clipped
+_NEAR_M = 0.02  # surfaces nearer to the camera of the view are clipped
 # references see the same surface if their depths in the view differ by less than this share
 _SAME_SURFACE = 0.02
 _MAX_JUMP = 0.05  # largest step between neighbouring depths of a surface, as a share of the nearer
@@ -172,7 +172,7 @@ def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) 
 def _at_resolution(
     source: WarpSource, focal: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None, Floats]:
-    """Return image and mask, downscaled if they are finer than the view, and the scale (2,)."""
+    """Return image and mask, reduced if their resolution exceeds the view's, and the scale (2,)."""
     height, width = source.image.shape[:2]
     factor = min(1.0, focal / focal_px(source.camera))
     mask = None if source.mask is None else source.mask.astype(np.float32)
@@ -186,7 +186,7 @@ def _at_resolution(
 
 
 def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
-    """Return a mask of the points (N, 3), seen by the depth sensor, that the image also sees."""
+    """Return a mask (N,) of the points, seen by the depth sensor, that the image also sees."""
     surface, _ = _seen_depth(source, source.camera, source.cam_from_world)
     inside = in_image(source.camera, px)
     columns, rows = np.floor(np.where(inside[:, None], px, 0)).astype(np.int64).T

@@ -150,8 +150,8 @@ def _too_few_agree(num_inliers: int, count: int, options: AbsolutePoseOptions) -
 def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[Floats, Floats]:
     """Return the errors in pixels (N,) of all matches and their Mahalanobis distances (N,).
 
-    The variance is one pixel plus the point's covariance. Both are infinite behind the camera and
-    for points that are not finite.
+    The covariance of an error is that of 1 px noise plus the projected covariance of the point.
+    Errors and distances are infinite behind the camera and for points that are not finite.
     """
     pose = undo_recentring(rig_from_world, -problem.offset)
     projected = _Projected.of(problem, pose)
@@ -164,8 +164,9 @@ def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[
 class _Projected:
     """Points of a problem projected in the recentred world.
 
-    ``residuals`` (N, 2) in pixels, NaN behind a camera; ``slopes`` (N, 2, 3) by the points in the
-    rig frame; ``in_rig`` (N, 3); ``depths`` (N,) in the camera.
+    ``residuals`` (N, 2) in pixels, NaN behind a camera; ``slopes`` (N, 2, 3), derivatives of the
+    pixels with respect to the points in the rig frame; ``in_rig`` (N, 3), these points; ``depths``
+    (N,) in the camera.
     """
 
     residuals: Floats
@@ -205,7 +206,10 @@ class _Projected:
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def jacobian(self, whitening: Floats) -> Floats:
-        """Return derivatives (N, 2, 6) of whitened residuals by a left perturbation of the pose."""
+        """Return the Jacobian (N, 2, 6) of whitened residuals for a left perturbation of the pose.
+
+        The first three columns are for rotation, the others for translation.
+        """
         by_point = _whitened(self.slopes, whitening)
         # a^T (omega x p) = omega^T (p x a)
         (x, y, z), (a, b, c) = self.in_rig.T[:, :, None], np.moveaxis(by_point, 2, 0)
@@ -302,8 +306,9 @@ def refine_pose(
 ) -> Pose | Failure:
     """Refine an estimate of ``rig_from_world`` of the same problem.
 
-    It is the ``cam_from_world`` of the returned Pose, which also has the covariance and the inlier
-    mask over all views (by errors in pixels, without the points' covariances).
+    The refined ``rig_from_world`` is the ``cam_from_world`` of the returned Pose, which also has
+    the covariance and the inlier mask over all views. Inliers are selected by errors in pixels,
+    without the points' covariances.
     """
     count = len(problem.points)
     pose = undo_recentring(estimate.rig_from_world, -problem.offset)
@@ -349,7 +354,8 @@ def _minimised(
     """Minimise the Cauchy loss of whitened residuals by Levenberg-Marquardt.
 
     A residual of length e has the weight ``w = 1 / (1 + e^2 / c^2)``. The gradient is the sum of
-    ``w J^T r``; the Hessian is that of ``w^2 J^T J``, its expectation over directions of r.
+    ``w J^T r``. The Hessian is approximated by the sum of ``w^2 J^T J``, its expectation over
+    directions of r.
     """
     squared_scale = (_CAUCHY_EFFICIENT * sigma) ** 2
     best, least, damping = pose, np.inf, 0.0
@@ -381,8 +387,9 @@ def _minimised(
 def check_stable(
     pose: Pose, covariance: Floats, depth: float, options: AbsolutePoseOptions
 ) -> Pose | Failure:
-    """Return the pose, or a Failure if its centre is too uncertain for the inliers' median
-    ``depth``.
+    """Return the pose, or a Failure if its centre is too uncertain.
+
+    The limit is relative to the inliers' median ``depth``.
     """
     deviation = center_deviation(covariance) / depth
     if deviation <= _MAX_CENTER_DEVIATION:

@@ -1,8 +1,9 @@
 """Cluster-wise localization: one pose per cluster of candidates, the best one refined.
 
 MegLoc, section "Cluster-wise localization": retrieval returns images of several similar locations,
-and matches of one are outliers to the pose of another. So candidates are clustered by camera
-centres or co-visibility, and each cluster is localized separately.
+and matches with images of one location are outliers to the pose at another. So candidates are
+clustered by camera centres or co-visibility, and the query is localized with each cluster
+separately.
 """
 
 from __future__ import annotations
@@ -55,14 +56,14 @@ MAX_CLUSTERS = 10
 class ClusterOptions(Options):
     by: Literal["none", "poses", "covisibility"] = Field(
         default="covisibility",
-        description="none: all candidates in one cluster; poses: images with nearby centres; "
-        "covisibility: images that see the same points",
+        description="none: all candidates in one cluster; poses: images with nearby camera "
+        "centres; covisibility: images that see the same points",
     )
     radius: float | None = Field(
         default=None,
         gt=0,
-        description="for poses: largest distance of linked camera centres, in map units; connected "
-        "images form a cluster",
+        description="for poses: largest distance between two linked camera centres, in map units; "
+        "connected images form a cluster",
     )
 
     @model_validator(mode="after")
@@ -85,7 +86,7 @@ def cluster_by_shared_points(
 ) -> NDArray[np.int64]:
     """Cluster images by shared points (N, N); labels (N,) in order of first members.
 
-    If no two images share a point (a map lifted from depth), all are one cluster.
+    If no two images share a point (all points come from depth images), all are one cluster.
     """
     apart = shared - np.diag(np.diag(shared))
     if not apart.any():
@@ -103,7 +104,7 @@ def cluster_candidates(
 ) -> list[tuple[str, ...]]:
     """Divide candidates, best first, into clusters within one coordinate frame each.
 
-    ``centers`` are camera centres (3,); ``indices`` are the map points by keypoints type.
+    ``centers`` are camera centres (3,); ``indices`` has one map index per keypoints type.
     """
     clusters: list[list[int]] = []
     for frame in dict.fromkeys(frames):
@@ -158,11 +159,11 @@ def localize_in_clusters(
 
     Parameters
     ----------
-    rank : scores of poses, higher is better.
+    rank : function that scores hypotheses; higher is better.
     frames : coordinate frame of each cluster; clusters of different frames are not merged.
-    centers : of the map images, (3,) each; needed for ``min_confidence``.
+    centers : camera centres (3,) of the map images; needed for ``min_confidence``.
     min_confidence : poses of lower confidence fail; None computes no confidence.
-    scene : images that are compared if the confidence is in doubt.
+    scene : reader of the images that are compared if the residuals of a pose are unusually large.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])
@@ -289,7 +290,7 @@ def _join_agreeing(
 
 
 def _best(clusters: Sequence[Pose | Failure]) -> int:
-    """Return the index of the best score; without scores, that of the most inliers."""
+    """Return the index of the cluster with the best score; without scores, the most inliers."""
 
     def key(at: int) -> tuple[bool, float, int, int, int]:
         cluster = clusters[at]
@@ -376,7 +377,7 @@ def poses_of_cameras(
             moved = transform_covariance(pose.covariance, view.cam_from_rig)
             pose = replace(pose, covariance=moved)
         failure = Failure(
-            "no inlier in this camera; others of its rig were localized",
+            "no inlier in this camera; other cameras of its rig were localized",
             name=view.name,
             num_matches=len(inliers),
             candidates=rig.candidates,

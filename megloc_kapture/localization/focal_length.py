@@ -1,11 +1,12 @@
 """Focal length and other intrinsics of a query's camera, estimated from the inliers of its pose.
 
-A wrong focal length moves the camera along its axis while most matches still agree, so it is freed
-once a pose is known (Gauss-Newton on rays, Cauchy weights). A calibrated camera is kept; if another
-focal length fits far better, the pose gets a remark and a lower confidence. An uncertain camera
-(``Camera.focal_deviation``) gets the most probable intrinsics given a prior (EXIF, image centre, no
-distortion), and the pose covariance includes their uncertainty; pycolmap's refinement has no prior.
-If the scene does not determine the focal length, the prior is kept.
+A wrong focal length moves the camera along its axis while most matches still agree. So the focal
+length is estimated again once a pose is known (Gauss-Newton on rays, Cauchy weights). A calibrated
+camera is kept; if another focal length fits far better, the pose gets a remark and a lower
+confidence. An uncertain camera (``Camera.focal_deviation``) gets the most probable intrinsics given
+a prior (EXIF, image centre, no distortion), which pycolmap's refinement does not support; the pose
+covariance includes their uncertainty. Where the matches do not determine the intrinsics, the prior
+does.
 """
 
 from __future__ import annotations
@@ -40,9 +41,11 @@ from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, LocalizationResult, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
-# map errors of neighbouring points are correlated, so deviations that assume independent matches
-# are too small by this factor (measured in docs/photos.md)
+# _CORRELATED: map errors of neighbouring points are correlated, so standard deviations that assume
+# independent matches are too small by this factor; _MIN_ERROR_PX: smallest assumed standard
+# deviation of a match
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
+# a focal length contradicts a calibrated one if they differ by this many standard deviations
 _MIN_SIGMAS = 3.0
 _MIN_INLIERS = 30
 _DOES_NOT_FIT = "does not fit"
@@ -51,22 +54,26 @@ _SMALL_STEP = 1e-4
 # largest relative change of a converged focal length
 _SETTLED = 1e-4
 _MAX_UPDATES = 8
-# the prior is doubted if P4Pf's focal length differs from it by more standard deviations
+# the prior is doubted if the focal length from the matches (P4Pf) differs from it by more than this
+# many standard deviations
 _MAX_DEVIATIONS = 3.0
-# prior deviation of a focal length that the matches contradict; a focal length with a smaller
-# deviation than the second value comes from calibration or several images and is never doubted
+# _DOUBTED_DEVIATION: relative standard deviation of a doubted prior; _MIN_DOUBTED: a prior with a
+# smaller one comes from calibration or several images, and is never doubted
 _DOUBTED_DEVIATION, _MIN_DOUBTED = 0.7, 0.1
-# prior standard deviations: principal point as a share of the larger side, radial distortion
+# prior standard deviations: principal point as a share of the longer side, radial distortion
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
-# deviations of a calibrated focal length (relative) and radial distortion
+# standard deviations of a calibrated focal length (relative) and of its radial distortion
 _CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
 # effective number of independent matches
 _INDEPENDENT = 30
-# verification with the given focal length biases the free one by this share of their difference
+# matches were verified with the given focal length, which biases the estimate towards it by this
+# share of their difference
 _BIASED_BY = 0.1
-# beyond this many standard deviations, the zoom differs
+# a photograph whose focal length differs from the shared one by more standard deviations has
+# another zoom
 _MAX_SIGMAS = 3.0
-# map and lens model errors are correlated between photographs (measured in docs/photos.md)
+# factor on the standard deviation of the shared focal length, because errors of the map and of the
+# lens model are correlated between photographs
 _ALIKE = 2.0
 
 
@@ -74,9 +81,10 @@ _ALIKE = 2.0
 class _Fit:
     """Best correction of a camera and its pose.
 
-    ``change`` (1, 3 or 4,): logarithm of the focal length factor; shift of the principal point over
-    the focal length; radial distortion. ``pose_covariance`` (6, 6): contribution of the camera's
-    uncertainty. ``depth``: the inliers' median.
+    ``change`` (3 or 4,): logarithm of the focal length's factor; shift of the principal point,
+    divided by the focal length; change of the radial distortion. ``pose_covariance`` (6, 6):
+    contribution of the camera's uncertainty to the pose covariance. ``depth``: median depth of the
+    inliers.
     """
 
     change: Floats
@@ -93,9 +101,10 @@ def is_uncertain(problem: PoseProblem) -> bool:
 
 @dataclass(frozen=True)
 class FocalMisfit:
-    """A focal length that fits far better.
+    """Remark on a focal length that fits far better than the given one.
 
-    ``shift`` is the motion of the camera divided by the points' distance.
+    ``shift`` is the resulting motion of the camera centre, divided by the median distance of the
+    inliers.
     """
 
     remark: str
@@ -105,14 +114,17 @@ class FocalMisfit:
 def focal_misfit(
     problem: PoseProblem, pose: Pose, options: AbsolutePoseOptions
 ) -> FocalMisfit | None:
-    """Find another focal length that fits far better; None for rigs and undetermined cases."""
+    """Return another focal length if it fits far better than the given one.
+
+    Also None for rigs, for few inliers, and if the matches do not determine the focal length.
+    """
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
     given = problem.views[0].camera
     fit = _freed(problem, pose.cam_from_world, pose.inliers, options.max_error_px)
     if fit is None or not fit.contradicts(given):
         return None
-    # inliers of a grossly wrong focal length hide the right one
+    # the inliers of a grossly wrong focal length favour it, so search again among all matches
     free = focal_from_matches(
         problem.points_px, problem.points, given, options.max_error_px, options.seed
     )
@@ -137,10 +149,11 @@ def focal_misfit(
 
 @dataclass(frozen=True)
 class _Freed:
-    """Pose with a free focal length and its relative deviation.
+    """Pose and focal length estimated together.
 
+    ``deviation``: relative standard deviation of the focal length.
     ``cost``: sum of squared errors of all matches, truncated at the inlier threshold; ``distance``:
-    the inliers' median.
+    median distance of the inliers from the camera.
     """
 
     focal_px: float
@@ -153,7 +166,7 @@ class _Freed:
         return math.log(self.focal_px / focal_px(given))
 
     def deviation_from(self, given: Camera) -> float:
-        """Return the logarithm's deviation, with calibration error and verification bias."""
+        """Return the standard deviation of the change, with calibration error and bias."""
         return math.hypot(self.deviation, _CALIBRATED, _BIASED_BY * self.change_from(given))
 
     def contradicts(self, given: Camera) -> bool:
@@ -166,9 +179,9 @@ def _freed(
     inliers: NDArray[np.bool_],
     max_error_px: float,
 ) -> _Freed | None:
-    """Free the focal length, and the other intrinsics within their calibration error.
+    """Estimate pose and focal length, and other intrinsics within their calibration error.
 
-    None if the matches do not determine it. Inliers are selected again in each round.
+    None if the matches do not determine the focal length. Each round selects the inliers again.
     """
     (view,) = problem.views
     focal = focal_px(view.camera)
@@ -224,9 +237,10 @@ def estimate_remark(camera: Camera, given: Camera) -> str:
 def estimate_with_intrinsics(
     problem: PoseProblem, options: AbsolutePoseOptions
 ) -> tuple[PoseProblem, PoseEstimate | Failure]:
-    """Estimate pose and intrinsics of an uncertain camera; the returned problem has that camera.
+    """Estimate pose and intrinsics of an uncertain camera.
 
-    Its ``focal_deviation`` is increased if the matches contradict the given focal length.
+    The returned problem has the estimated camera; its ``focal_deviation`` is larger than the given
+    one if the matches contradict the given focal length.
     """
     given = problem.views[0].camera
     best = estimate_pose(problem, options)
@@ -261,7 +275,7 @@ def _scaled(given: Camera, focal: float) -> Camera:
 
 
 def _is_possible(problem: PoseProblem, estimate: PoseEstimate, given: Camera) -> bool:
-    """Return True if the prior allows the focal length or the matches contradict it."""
+    """Return True if the prior allows the focal length, or the matches contradict the prior."""
     camera = problem.views[0].camera
     change = math.log(focal_px(camera) / focal_px(given))
     if abs(change) <= _MAX_DEVIATIONS * given.focal_deviation:
@@ -280,7 +294,8 @@ def refine_with_intrinsics(
 ) -> tuple[PoseProblem, Pose | Failure]:
     """Refine pose and intrinsics of an uncertain camera in alternation.
 
-    ``given`` is the camera with its prior deviation; problem and Pose get the posterior one.
+    ``given`` is the camera with its prior deviation. The returned problem and Pose have the refined
+    intrinsics; the posterior ``focal_deviation`` is in the Pose's camera only.
     """
     updates = 0
     while True:
@@ -322,7 +337,7 @@ def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
     known = max(given.focal_deviation, camera.focal_deviation)
-    # a well-known focal length comes from calibration or several images, and so does the rest
+    # a well-known focal length comes from calibration or several images, as do the other intrinsics
     deviation = min(_PRINCIPAL_POINT_DEVIATION, known) * max(camera.width, camera.height) / focal
     change = [math.log(focal_px(given) / focal), *shift]
     deviations = [known, deviation, deviation]
@@ -375,9 +390,10 @@ def _free_camera(
 ) -> tuple[Floats, RigidTransform, float, Floats] | None:
     """Fit pose and camera change to inliers' rays (N, 2) and points (N, 3) in the camera frame.
 
-    ``expected`` and ``deviations`` are the prior of ``change`` (:class:`_Fit`); ``correlated``
-    scales the deviations. Returns the change, the motion of the points, their median depth and the
-    covariance of motion (left perturbation) and change; None if undetermined.
+    ``expected`` and ``deviations`` are the prior of ``change`` (:class:`_Fit`). ``correlated``
+    multiplies the noise of the matches, whose errors are correlated. Returns the change, the motion
+    of the points, their median depth and the covariance of motion (left perturbation) and change;
+    None if undetermined.
     """
     rotation, translation = np.eye(3), np.zeros(3)
     prior_weight = (correlated / deviations) ** 2
@@ -392,7 +408,7 @@ def _free_camera(
         weights = 1 / (1 + squared / (5.7 * variance))
         information = np.einsum("nik,n,nil->kl", jacobian, weights, jacobian)
         gradient = np.einsum("nik,n,ni->k", jacobian, weights, residuals)
-        # lens model errors do not average out with more matches
+        # the lower bound is for errors of the lens model, which do not average out
         trusted = max(variance, (_MIN_ERROR_PX / focal) ** 2)
         information[intrinsics, intrinsics] += trusted * prior_weight
         gradient[intrinsics] += trusted * prior_weight * (change - expected)
@@ -445,7 +461,7 @@ def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, F
 
 
 def shared_camera(cameras: Sequence[Camera]) -> Camera:
-    """Average estimates of one camera by medians weighted with their inverse variances."""
+    """Combine estimates of one camera by medians of the parameters, weighted by 1 / variance."""
     weights = np.array([camera.focal_deviation**-2.0 for camera in cameras])
     params = np.array([camera.params for camera in cameras])
     order = np.argsort(params, axis=0, kind="stable")
@@ -459,7 +475,8 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
     """Re-solve poses of photographs of one camera with a shared estimate of its intrinsics.
 
-    A pose is kept if its focal length contradicts the others (zoom) or if it was refined otherwise.
+    A pose is kept as it is if its focal length contradicts the shared one (another zoom) or if it
+    was refined by another method.
     """
     usable = [p.camera for p in poses if p.camera is not None and p.camera.focal_deviation > 0]
     if len(usable) < 2:
@@ -483,7 +500,7 @@ def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions
 
 
 def _solved(pose: Pose, shared: Camera, number: int, options: AbsolutePoseOptions) -> Pose:
-    """Solve a pose with the shared camera; keep it if its inliers do not allow that."""
+    """Solve a pose with the shared camera; return it unchanged if that fails."""
     if pose.inlier_points_px is None or pose.inlier_points_world is None:
         return pose
     inliers = pose.inlier_points_px, pose.inlier_points_world
@@ -495,7 +512,7 @@ def _solved(pose: Pose, shared: Camera, number: int, options: AbsolutePoseOption
         return pose
     camera = solved.camera
     remark = (
-        f"focal length estimated of {number} photographs: {focal_px(camera):.0f} +- "
+        f"focal length estimated from {number} photographs: {focal_px(camera):.0f} +- "
         f"{camera.focal_deviation * focal_px(camera):.0f} px"
     )
     return replace(

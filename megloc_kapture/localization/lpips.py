@@ -20,8 +20,8 @@ class LpipsOptions(NetworkOptions):
     net: Trunk = Field(default="alex", description="alex, vgg or squeeze")
     trunk: str = Field(
         default="",
-        description="file of trunk weights with torchvision's names; empty: the published "
-        "lpips-trunk-alex, -vgg or -squeeze",
+        description="file of trunk weights with torchvision's parameter names; empty: the "
+        "published lpips-trunk-alex, -vgg or -squeeze",
     )
     heads: str = Field(
         default="", description="file of linear heads; empty: lpips-alex, -vgg or -squeeze"
@@ -31,8 +31,8 @@ class LpipsOptions(NetworkOptions):
 class LpipsDistance:
     """Plugin ``lpips``: LPIPS 0.1 (:class:`megloc_kapture.nets.lpips.Lpips`) over the valid pixels.
 
-    With other weights its name is ``lpips-like-NET``, since its values are not comparable with
-    published ones.
+    Its name is ``lpips-NET`` with the published weights and ``lpips-like-NET`` with others, whose
+    values are not comparable with published ones.
     """
 
     name = "lpips"

@@ -73,7 +73,7 @@ class MapIndex:
 
     @cached_property
     def seen_once(self) -> NDArray[np.bool_]:
-        """Return the points (N,) with one observation: lifted by depth, not triangulated."""
+        """Return a mask (N,) of points with one observation: from depth, not triangulation."""
         return np.bincount(self.point_ids, minlength=len(self.xyz)) == 1
 
     def observed(self, image: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -112,7 +112,7 @@ class MapIndex:
 
 
 def _paired(high: Integers, low: Integers) -> NDArray[np.int64]:
-    """Join two indices of 31 bits in one number, for faster sorting."""
+    """Pack two indices of 31 bits into one number, for faster sorting."""
     return (high.astype(np.int64) << 32) | low
 
 
@@ -128,10 +128,11 @@ class Correspondences:
 
     Attributes
     ----------
-    keypoint_ids, point_ids : int64 (N,), rows of the query's keypoints, ascending, and of the
+    keypoint_ids, point_ids : int64 (N,), rows of the query's keypoints, ascending, and of the map
         points.
-    support : int64 (N,), number of map images with the match.
-    image_rows : int64 (sum of support,), these images, grouped by match.
+    support : int64 (N,), number of map images that give the match.
+    image_rows : int64 (sum of support,), these images as indices into ``TypedMatches.matches``,
+        grouped by match.
     """
 
     keypoint_ids: NDArray[np.int64]
@@ -149,8 +150,9 @@ def resolve_conflicts(
 ) -> Correspondences:
     """Select one point per keypoint and one keypoint per point from conflicting matches (M,).
 
-    The selection is greedy. Triangulated points precede lifted ones (``seen_once``); then the order
-    is by number of map images (``image_rows``), similarity and ids.
+    The selection is greedy. Triangulated points come before points with a single observation, which
+    are from depth (``seen_once``); then matches are sorted by the number of map images that give
+    them (``image_rows``), by similarity and by ids.
     """
     if len(keypoint_ids) == 0:
         none = np.zeros(0, dtype=np.int64)
@@ -187,8 +189,8 @@ def resolve_conflicts(
 class TypedMatches:
     """Matches of one query image in one keypoints type.
 
-    ``keypoints_px`` float32 (N, 2 or more) are the query's; ``matches`` has the map image, rows of
-    query and map keypoints (K, 2) and scores (K,) per candidate.
+    ``keypoints_px`` float32 (N, 2 or more) are the query's. ``matches`` has, for each candidate,
+    the name of the map image, rows of query and map keypoints (K, 2), and scores (K,).
     """
 
     index: MapIndex
@@ -197,9 +199,9 @@ class TypedMatches:
 
     @cached_property
     def observed(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.int64]]:
-        """Return the matches with points of the map, conflicts included, (M,) each.
+        """Return the matches of map keypoints that have a map point, conflicts included.
 
-        They are query keypoint rows, point rows, scores and candidate indices.
+        The arrays (M,) are query keypoint rows, point rows, scores and candidate indices.
         """
         empty = np.zeros(0, dtype=np.int64)
         rows, points, similarities, candidates = [empty], [empty], [np.zeros(0)], [empty]
@@ -306,7 +308,7 @@ def _joined(parts: Sequence[NDArray[np.floating[Any]]], width: int) -> Floats:
 
 
 def _amid(points: Floats) -> Floats:
-    # the median of some of them: any point nearby serves, and wrong points must not move it far
+    # the median of a subset: any point nearby will do, and outliers must not move it far
     some = points[:: max(1, len(points) // 64)]
     some = np.sort(some[np.isfinite(some).all(axis=1)], axis=0)
     return some[len(some) // 2] if len(some) else np.zeros(3)

@@ -1,8 +1,8 @@
 """Rankers of candidate poses: by inliers, or by the image distance to warped map images.
 
 MegLoc, section "Cluster-wise localization", indoor strategy: a view is rendered at each cluster's
-pose and the most similar one wins. ``perceptual`` warps it from the cluster's map images with
-depth.
+pose, and the pose whose view is most similar to the query wins. ``perceptual`` warps the view from
+the cluster's map images with depth.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class DistinctiveInliersOptions(Options):
     radius: float = Field(
         default=0.03,
         ge=0,
-        description="radius around an inlier, as a share of the image's longer side",
+        description="radius within which inliers of two hypotheses count as the same, as a share "
+        "of the image's longer side",
     )
     power: float = Field(
         default=4.0, gt=0, description="exponent of the sharing; 1 shares an inlier evenly"
@@ -107,7 +108,7 @@ def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ANOTHER_VIEW = 0.2  # smallest difference of two references, radians
+_ANOTHER_VIEW = 0.2  # views that differ by less are near duplicates, see _nearest_first
 
 
 class PerceptualOptions(Options):
@@ -115,7 +116,8 @@ class PerceptualOptions(Options):
         default=5,
         ge=1,
         le=1000,
-        description="number of map images with depth per view: the nearest without near duplicates",
+        description="number of map images with depth per view: the nearest ones; near duplicates "
+        "only if there are too few others",
     )
     long_side: int = Field(
         default=320, ge=16, description="longer side of the compared views, pixels; never enlarged"
@@ -134,14 +136,14 @@ class PerceptualOptions(Options):
         default=0.05,
         ge=0,
         le=1,
-        description="smallest share of the best cluster's inliers; clusters below it are not "
+        description="clusters with fewer inliers than this share of the largest number are not "
         "compared",
     )
     min_valid: float = Field(
         default=0.15,
         ge=0,
         le=1,
-        description="share of the query's pixels that must be comparable",
+        description="smallest share of the query's pixels that must be comparable",
     )
     finalists: int = Field(
         default=6,
@@ -159,11 +161,12 @@ class _Compared(NamedTuple):
 class PerceptualRanker:
     """Plugin ``perceptual``: smallest image distance of the query to the view warped to its pose.
 
-    Only clusters with enough inliers take part (``min_inlier_share``). Those with the smallest
-    distances, the finalists, are compared pairwise over the pixels valid in both, since distances
-    over different image parts are not comparable; a finalist's score is its mean margin. The others
-    follow by their distance, then clusters without depth or with few inliers. If the best cluster
-    of ``distinctive`` has no valid view, that ranker's scores are returned.
+    Only clusters with enough inliers take part (``min_inlier_share``). The clusters with the
+    smallest distances, the finalists, are compared pairwise over the pixels valid in both, since
+    distances over different image parts are not comparable; a finalist's score is its mean margin.
+    The remaining clusters follow by their distance, then those without depth or with few inliers.
+    If the cluster that ``distinctive`` ranks first has no valid view, the scores of ``distinctive``
+    are returned.
     """
 
     Options = PerceptualOptions
@@ -318,10 +321,11 @@ def _mask_at_size(mask: Mask, width: int, height: int) -> Mask:
 def _nearest_first(
     images: Sequence[str], cam_from_world: RigidTransform, scene: RankingScene
 ) -> list[str]:
-    """Sort images by similarity to the pose; images that repeat an earlier view come last.
+    """Sort images by similarity to the pose; near duplicates of an earlier image come last.
 
-    The difference of two views is the angle of their axes plus the distance of their centres, over
-    the median distance to the pose. Repeated video frames would leave most of a view uncovered.
+    The difference of two views is the angle between their axes plus the distance between their
+    centres, the latter divided by the images' median distance from the pose. Near duplicates, such
+    as successive video frames, would leave most of the view uncovered.
     """
     if not images:
         return []

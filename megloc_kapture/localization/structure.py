@@ -20,13 +20,14 @@ from megloc_kapture.values import Camera, Options, Pose, RigidTransform
 
 _NOISE_VARIANCE = 9.0  # the constant c, grey levels squared: smaller variance counts as noise
 _MIN_FILLED = 0.5  # smallest valid share of a window
-# half side of a point's patch and radius of its search, in pixels of the localized query
+# half side of a point's patch and radius of the search for it, in pixels of the query image
 _HALF_PATCH_PX, _SEARCH_PX = 12, 6
-# limits that bound the time: points per view, and map images that patches are taken from
+# limits that bound the time: points per view, and map images from which patches are taken
 _MAX_POINTS, _MAX_IMAGES = 300, 4
-# a patch with a smaller deviation has no texture; one with a smaller correlation is not found
+# a patch with a smaller standard deviation has no texture; with a smaller correlation, it counts as
+# not found
 _MIN_DEVIATION, _MIN_CORRELATION = 5.0, 0.6
-# patches are compared as planes that face the camera
+# largest ratio of scales of query and map image; patches are treated as fronto-parallel planes
 _MAX_SCALE = 2.0
 Float32 = NDArray[np.float32]
 
@@ -38,7 +39,8 @@ class StructureOptions(Options):
         default=0.02,
         gt=0,
         le=0.5,
-        description="deviation of the Gaussian windows, share of the image's longer side",
+        description="standard deviation of the Gaussian windows, as a share of the image's longer "
+        "side",
     )
 
 
@@ -46,7 +48,7 @@ class StructureDistance:
     """Plugin ``structure``: one minus the local correlation of two images' brightness.
 
     SSIM's structure term (Wang et al., IEEE TIP 2004, eq. 10), ``(cov + c) / (s_a s_b + c)`` in
-    Gaussian windows over valid pixels; exposure and shading do not count.
+    Gaussian windows over valid pixels. Differences in exposure and shading have little effect.
     """
 
     name = "structure"
@@ -91,7 +93,7 @@ class StructureDistance:
 
 
 def _grey(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Float32:
-    """Return brightness float32 (H, W) around zero, so that squares keep their digits."""
+    """Return brightness float32 (H, W) with zero mean, so that squares lose no precision."""
     grey = _grey_levels(image).astype(np.float32)
     return np.asarray(grey - grey[valid].mean(), np.float32)
 
@@ -109,10 +111,10 @@ def displacements_rad(
 ) -> NDArray[np.float64]:
     """Return angles (K,) in radians between inliers' projections and their patches in the query.
 
-    A patch is taken around the point in the first map image of the match. At night or in another
-    season, detectors find other points of the same corner although the pose is right; the patch is
-    then at the projection. In a similar or mirrored scene the patch is displaced like the keypoint.
-    Empty if images cannot be read.
+    A patch is cut out around the point in the first map image of the match, and is searched for in
+    the query. At night or in another season, detectors fire elsewhere on the same corner; for a
+    correct pose, the patch is nevertheless at the projection. In a similar or mirrored scene, the
+    patch is displaced like the keypoint. Empty if images cannot be read.
     """
     assert pose.inliers is not None  # poses estimated by localization have them
     angles = [np.zeros(0)]

@@ -26,8 +26,8 @@ Floats = NDArray[np.float64]
 # if the depth sensor is next to the camera, a keypoint's pixel in the depth map depends on its
 # depth, so both are iterated; points that do not converge are hidden behind an edge
 _ROUNDS = 6
-_SETTLED = 0.01  # largest last change of a converged depth, relative
-# deviations of estimated depth are for a keypoint noise of 1 / _PIXELS_OF_SIGMA pixels
+_SETTLED = 0.01  # largest relative change of a converged depth in the last round
+# standard deviations of estimated depth are for a keypoint noise of 1 / _PIXELS_OF_SIGMA pixels
 _PIXELS_OF_SIGMA = 3.0
 # if the four depths around a keypoint differ by more than this share of the smallest, the keypoint
 # is on an edge and has no depth
@@ -94,8 +94,9 @@ def lift_with_covariances(
     """Lift keypoints with a depth map that has the image's centre; also return covariances.
 
     ``sigma_m`` float32 (H, W) are the standard deviations of depth for a keypoint noise of a third
-    of a pixel (the pose's ``map_noise``), 0 where unknown. Returns points (N, 3) in the camera's
-    frame, their covariances (N, 3, 3) for a keypoint noise of 1 px, and a validity mask (N,).
+    of a pixel, as pose refinement assumes for a map, 0 where unknown. Returns points (N, 3) in the
+    camera's frame, their covariances (N, 3, 3) for a keypoint noise of 1 px, and a validity mask
+    (N,).
     """
     same = RigidTransform.identity()
     points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same)
@@ -226,7 +227,7 @@ def compare_with_depth(
     lines = np.clip(line[:, None, None] + reach[None, :, None], 0, height - 1)
     window = depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)
     known = np.isfinite(window) & (window > 0)
-    # next to a hole, the sensor may have missed the surface
+    # skip points next to a hole, where the sensor may have missed the surface
     whole = known.all(axis=1)
     rows, window = rows[whole], window[whole]
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)

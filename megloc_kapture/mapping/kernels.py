@@ -14,7 +14,7 @@ from numba import get_num_threads
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.projection import PINHOLES, distorted
 
-# a point is undetermined if the pivots of its information matrix have a smaller ratio
+# a point is undetermined if a pivot of its information matrix is a smaller share of the trace
 _MIN_RATIO = 1e-13
 
 
@@ -38,7 +38,7 @@ def most_shared(
 
     Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations are sorted by
     track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``. At most
-    ``window`` observations before and after are visited.
+    ``window`` observations of the track before and after an observation are visited.
     """
     shared = np.zeros(len(best), np.int64)
     touched = np.empty(len(best), np.int64)
@@ -91,7 +91,7 @@ def covariances_of_points(
             if models[k] > PINHOLES:  # twice as fast for pinholes
                 _, _, au, av, bu, bv = distorted(models[k], params[k], u, v)
             fx, fy = params[k, 0] * inverse, params[k, 1] * inverse
-            # z times the derivatives of u and v by the point in the world
+            # z times the derivatives of u and v with respect to the point in the world
             u0, u1, u2 = r00 - u * r20, r01 - u * r21, r02 - u * r22
             v0, v1, v2 = r10 - v * r20, r11 - v * r21, r12 - v * r22
             a, b, c = fx * (au * u0 + av * v0), fx * (au * u1 + av * v1), fx * (au * u2 + av * v2)
@@ -102,7 +102,7 @@ def covariances_of_points(
             yy += b * b + e * e
             yz += b * c + e * f
             zz += c * c + f * f
-        # M = L D L^T, and its inverse from that
+        # factorize M = L D L^T, and compute the inverse from the factors
         least = _MIN_RATIO * (xx + yy + zz)
         determined = xx > least and xx < math.inf
         if determined:

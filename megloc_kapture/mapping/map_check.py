@@ -30,16 +30,17 @@ Origin = Literal["corner", "centre"]
 Floats = NDArray[np.float64]
 
 _HALF = 0.5
-_MIN_GAIN = 0.005  # smaller gains are noise
-# largest median error of an image, as a share of its larger side
+_MIN_GAIN = 0.005  # a smaller relative decrease of the reprojection error is noise
+# largest median error of an image: a share of its longer side, or the second value if larger
 _MAX_SHARE, _MIN_LIMIT_PX = 0.01, 8.0
-_MAX_FAILING = 0.2  # images: some poses of a good map are wrong
+_MAX_FAILING = 0.2  # largest share of failing images; even a good map has some wrong poses
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedKeypoints:
-    """A map image with keypoints (K, 2), and its observations as rows of keypoints and of points
-    (M,).
+    """A map image with keypoints (K, 2) and observations.
+
+    ``rows`` and ``points`` (M,) are the rows of the observed keypoints and of their map points.
     """
 
     name: str
@@ -50,8 +51,9 @@ class ObservedKeypoints:
     points: NDArray[np.integer]
 
     def errors_px(self, xyz: Floats, shift_px: float = 0.0) -> Floats:
-        """Return reprojection errors (M,) of points (N, 3), keypoints shifted; NaN behind the
-        camera.
+        """Return reprojection errors (M,); NaN behind the camera.
+
+        ``xyz`` (N, 3) are all map points; ``shift_px`` is added to the keypoints.
         """
         with np.errstate(invalid="ignore"):
             seen = project(self.camera, self.cam_from_world, xyz[self.points])
@@ -60,10 +62,10 @@ class ObservedKeypoints:
 
 @dataclass(frozen=True)
 class PixelOrigin:
-    """Pixel origins of a map as stored, and the reason.
+    """Pixel origins of a map as stored, and the reason for this result.
 
-    ``error_px`` is the median reprojection error by the intrinsics' origin; NaN without
-    observations.
+    ``error_px`` has the median reprojection error for each assumed origin of the intrinsics; NaN
+    without observations.
     """
 
     intrinsics: Origin
@@ -123,7 +125,7 @@ def find_pixel_origin(
         elif centred:
             where = "and every principal point is ((w-1)/2, (h-1)/2)"
         else:
-            where = "and the principal points indicate no other"
+            where = "and the principal points indicate no other origin"
         fit = "keypoints and intrinsics have the same origin"
         reason = f"{fit if images else 'no observation to compare with'}, {where}"
     shift_of_keypoints = _HALF if keypoints == "centre" else 0.0
@@ -180,7 +182,7 @@ def camera_fault(camera: Camera) -> str | None:
     focal = focal_px(camera)
     if not 0.05 * size <= focal <= 100 * size:
         return f"the focal length is {focal:g} px in {camera.width}x{camera.height} pixels"
-    # distortion is moderate halfway to the borders
+    # distortion of a real lens is moderate halfway to the borders
     halfway = np.array([[0.25, 0.5], [0.75, 0.5], [0.5, 0.25], [0.5, 0.75]])
     pixels = halfway * (camera.width, camera.height)
     rays = normalized_from_px(camera, pixels)
@@ -196,7 +198,7 @@ def camera_fault(camera: Camera) -> str | None:
 
 
 def _median_errors_px(images: Iterable[ObservedKeypoints], xyz: Floats) -> Floats:
-    """Return each image's median reprojection error, infinite if most points are behind it."""
+    """Return median reprojection errors of images; infinite if most points are behind a camera."""
     errors = (image.errors_px(xyz) for image in images)
     return np.array([np.median(np.where(np.isfinite(each), each, np.inf)) for each in errors])
 
@@ -206,7 +208,7 @@ def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[s
     best = ("", np.inf)
     for name, read in _readings(images, xyz):
         error = float(np.median(_median_errors_px(map(read, images), xyz)))
-        # of similar errors take the first, which is the simplest interpretation
+        # of interpretations with similar errors take the first, which is the simplest
         if error < 0.9 * best[1]:
             best = (name, error)
     return best

@@ -14,9 +14,9 @@ from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 _BLOCK_ELEMENTS = 1 << 20  # distances held at once, about 80 bytes each
-# largest number of neighbours searched for similar viewing directions
+# largest number of neighbours that are searched for similar viewing directions
 _MAX_SEARCHED = 1024
-# in a track, an image shares the point with this many images before and after it
+# in longer tracks, an image shares the point with at most this many images before and after it
 _TRACK_WINDOW = 512
 _IMAGES_AT_ONCE = 256
 # tested points: number of pixels across and down, and depths as multiples of the baseline
@@ -60,7 +60,8 @@ def pairs_by_poses(
 ) -> NDArray[np.int64]:
     """Return pairs (P, 2) of nearby images with similar viewing directions, i < j, sorted.
 
-    It searches growing neighbourhoods in a k-d tree, up to the 1024 nearest centres.
+    The search extends to more and more neighbours in a k-d tree, at most the 1024 nearest centres
+    (or ``num_neighbours``, if larger).
     """
     options = options or PairsByPosesOptions()
     count = len(cams_from_world)
@@ -96,7 +97,7 @@ def pairs_by_poses(
     return unique_pairs(np.concatenate(parts))
 
 
-# smallest number of shared points, equal to the number of matches of a verified pair
+# smallest number of shared points, equal to the smallest number of matches of a verified pair
 _MIN_SHARED_POINTS = 15
 
 
@@ -110,17 +111,17 @@ def pairs_by_covisibility(
     image_ids: NDArray[np.integer[Any]],
     options: PairsByCovisibilityOptions | None = None,
 ) -> NDArray[np.int64]:
-    """Pair each image with those that share most points; int64 (P, 2), i < j, sorted.
+    """Pair each image with those that share the most points; int64 (P, 2), i < j, sorted.
 
-    Observations (O,) are in any order. In longer tracks, an image shares the point only with the
-    512 images before and after it.
+    Observations (O,) are in any order. In long tracks, an image shares the point only with the 512
+    images of the track before and after it.
     """
     from megloc_kapture.mapping import kernels
 
     options = options or PairsByCovisibilityOptions()
     if len(point_ids) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    # observations as numbers, sorted by point, then image
+    # observations as single numbers, sorted by point, then image
     keys = each_once(np.asarray(point_ids, dtype=np.int64) * num_images + image_ids)
     points, images = np.divmod(keys, num_images)
     track_ends = np.flatnonzero(np.append(points[1:] != points[:-1], True)) + 1

@@ -1,10 +1,11 @@
 """Covariances of map points, and rejection of uncertain points.
 
 MegLoc, section "Mapping": with ``p_c = R_cw p_w + t_cw`` and the projection ``pi``, an observation
-has the Jacobian ``J = d pi / d p_c  R_cw`` with poses and cameras fixed (the printed equation has a
-malformed middle term, and ``R_wc`` instead of ``R_cw``). For independent noise of one pixel, a
-point's covariance is the inverse of ``sum J^T J``; the roots of its eigenvalues are standard
-deviations along orthogonal axes. ``d pi / d p_c`` includes the camera's distortion.
+has the Jacobian ``J = d pi / d p_c  R_cw`` with poses and cameras fixed (the equation in the paper
+has a malformed middle term, and ``R_wc`` instead of ``R_cw``). For independent noise of one pixel,
+a point's covariance is the inverse of ``sum J^T J``; the square roots of the covariance's
+eigenvalues are standard deviations along orthogonal axes. ``d pi / d p_c`` includes the camera's
+distortion.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def point_covariances(
 ) -> Floats:
     """Return covariances (N, 6) of points (N, 3) as xx, xy, xz, yy, yz, zz for a noise of 1 px.
 
-    Observations (O,) are in any order; those behind a camera are ignored. NaN if undetermined.
+    Observations (O,) are in any order; those with the point behind the camera are ignored. NaN if
+    the observations do not determine the point.
     """
     from megloc_kapture.geometry.projection import packed_views
     from megloc_kapture.mapping import kernels
@@ -58,7 +60,7 @@ def point_covariances(
 
 
 def point_deviations(covariances: Floats) -> Floats:
-    """Return deviations (N, 3) along the principal axes, ascending; NaN if unknown."""
+    """Return standard deviations (N, 3) along principal axes, ascending; NaN if unknown."""
     deviations = np.full((len(covariances), 3), np.nan)
     known = np.isfinite(covariances).all(axis=1)
     matrices = covariances[known][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
@@ -89,16 +91,18 @@ def _starts(ids: NDArray[np.integer], count: int) -> NDArray[np.int64]:
 
 
 class UncertaintyOptions(Options):
-    """Limit of the points' uncertainty: the largest deviation for a noise of 1 px.
+    """Limit of the points' uncertainty.
 
-    Points of unknown uncertainty (lifted ones with a single observation) are kept.
+    The uncertainty is the largest standard deviation of a point over all directions, for a keypoint
+    noise of 1 px, divided by the point's depth. Points of unknown uncertainty, which have a single
+    observation and come from depth, are kept.
     """
 
     max_robust_sigmas: float | None = Field(
         default=None,
         gt=0,
-        description="limit for a point's relative uncertainty (log of deviation over depth), in "
-        "robust standard deviations above the map's median; none: no limit",
+        description="limit for a point's relative uncertainty (log of standard deviation over "
+        "depth), in robust standard deviations above the map's median; none: no limit",
     )
 
 
@@ -148,7 +152,7 @@ def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
 
 
 def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) -> Mask:
-    """Return a mask (N,) of points to reject by their largest deviation and mean depth (N,)."""
+    """Return a mask (N,) of points to reject by largest standard deviation and mean depth (N,)."""
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         relative = deviations / depths
         usual = relative[np.isfinite(relative) & (relative > 0)]
@@ -163,7 +167,7 @@ def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) 
 def left_with_too_few(
     point_ids: NDArray[np.int64], dropped: Mask, num_points: int, min_observations: int
 ) -> Mask:
-    """Return points (N,) that lost an observation and have fewer than ``min_observations`` left."""
+    """Return a mask (N,) of points that lost an observation and have too few left."""
     lost = np.bincount(point_ids[dropped], minlength=num_points)
     left = np.bincount(point_ids[~dropped], minlength=num_points)
     return (lost > 0) & (left < min_observations)

@@ -2,13 +2,13 @@
 
 MegLoc, section "Guided pyramid matching": for pairs with fewer than 100 matches, features of scaled
 and rotated variants of one image are matched with the other image. All matches are combined
-(``all``), or those of the variant with the most matches are kept (``max``). The paper counts the
-matcher's matches; counting verified matches suits any matcher.
+(``all``), or those of the variant with the most matches are kept (``max``). The paper counts all
+matches of the matcher; a count of verified matches, the default, suits any matcher.
 
 Each variant is verified separately: most have the wrong rotation, and their random matches would
-outnumber the inliers of a common two-view model. Without known poses a few random matches fit some
-model, so all variants must agree with the model of the variant with the most matches. Only matched
-keypoints are added to an image.
+outnumber the inliers of a common two-view model. Without known poses, a few random matches always
+fit some model, so all variants must agree with the model of the variant (or of the original images)
+with the most matches. Only matched keypoints are added to an image.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class GuidedPyramidOptions(Options):
     rotations_deg: tuple[int, ...] = Field(
         default=(0, 90, 180, 270),
         min_length=1,
-        description="rotations at which they are matched again, multiples of 90",
+        description="rotations at which pairs with few matches are matched again, multiples of 90",
     )
 
     @field_validator("scales")
@@ -157,15 +157,15 @@ class GuidedPyramidOptions(Options):
         return tuple(sorted({rotation % 360 for rotation in rotations}))
 
     def is_hard(self, num_found: int, num_verified: int) -> bool:
-        """Return True if a pair with these numbers of matches is tried again."""
+        """Return True if a pair with these numbers of matches is matched again."""
         count = num_found if self.count == "matches" else num_verified
         return self.mode != "off" and count < self.min_matches
 
     def variants(self, width: int, height: int) -> list[ImageVariant]:
         """List the variants of an image of this size, without the identity.
 
-        Scales beyond ``_MAX_SIDE_PX`` are reduced to it, or omitted if the next smaller one is
-        close.
+        Scales that would enlarge the longer side beyond ``_MAX_SIDE_PX`` are replaced by the scale
+        that reaches it, unless the next smaller scale is close to it.
         """
         limit = max(1.0, _MAX_SIDE_PX / max(width, height))
         scales = [scale for scale in self.scales if scale <= limit]
@@ -176,24 +176,24 @@ class GuidedPyramidOptions(Options):
 
 
 def pyramid_type(local_type: str) -> str:
-    """Return the keypoints type whose keypoints are those of a type, followed by added ones."""
+    """Return the keypoints type of a pyramid: keypoints of ``local_type``, then added ones."""
     return local_type + _SUFFIX
 
 
 def base_type(local_type: str) -> str:
-    """Return the type that a pyramid's keypoints begin with."""
+    """Return the keypoints type on which a pyramid type is based; other types unchanged."""
     return local_type.removesuffix(_SUFFIX)
 
 
 def equivalent_types(local_type: str) -> tuple[str, ...]:
-    """Return the types whose query features can be matched with a type, best first."""
+    """Return the types of query features that can be matched with a map's type, best first."""
     base = base_type(local_type)
     return tuple(dict.fromkeys((local_type, base, pyramid_type(base))))
 
 
 @dataclass(frozen=True, eq=False)
 class VariantFeatures:
-    """Features of a variant in its own pixels, and keypoints float32 (N, C) in the original's."""
+    """Features of a variant in its pixels; keypoints float32 (N, C) in pixels of the original."""
 
     variant: ImageVariant
     features: ImageFeatures
@@ -229,10 +229,10 @@ class VariantMatches:
 
 @dataclass(frozen=True)
 class PairVerifier:
-    """Verifier of an image's matches with another one.
+    """Verifier of the matches of an image's variants with another image.
 
-    ``verify`` returns a mask of matches (K, 2) of a variant, best first; ``agree`` filters the
-    verified matches of all variants.
+    ``verify`` returns a mask (K,) of the matches (K, 2) of a variant, given best first; ``agree``
+    filters the verified matches of all variants.
     """
 
     verify: Callable[[VariantFeatures, NDArray[np.int64]], NDArray[np.bool_]]
@@ -244,8 +244,9 @@ def verify_best_first(
     matches: NDArray[np.int64],
     scores: NDArray[np.floating[Any]],
 ) -> NDArray[np.bool_]:
-    """Return the mask (N,) of ``verify`` for matches (N, 2), which it gets by descending scores
-    (N,).
+    """Verify matches (N, 2), passed in the order of descending scores (N,).
+
+    The returned mask (N,) is in the order of ``matches``.
     """
     order = np.argsort(-scores, kind="stable")
     good = np.zeros(len(matches), dtype=bool)
@@ -261,13 +262,13 @@ def extract_variants(
     *,
     like: ImageFeatures,
 ) -> tuple[list[VariantFeatures], dict[ImageVariant, str]]:
-    """Extract features of an image's variants; return the reasons for variants without any.
+    """Extract features of an image's variants; also return reasons for variants without features.
 
     Parameters
     ----------
     image, mask : uint8 (H, W, 3), RGB; bool (H, W), True = use.
-    extract : a DataError without path, as for an image too small for the network, skips the
-        variant.
+    extract : if it raises a DataError without a path, as for an image too small for the network,
+        the variant is skipped.
     like : features of the image itself, which define the number of columns.
     """
     height, width = image.shape[:2]

@@ -22,7 +22,8 @@ class NearestNeighbourOptions(Options):
         default=None,
         gt=0,
         le=1,
-        description="largest ratio of the distances to the best and the second best; none: no test",
+        description="largest ratio of the distances to the best and to the second-best descriptor; "
+        "none: no test",
     )
     min_similarity: float | None = Field(
         default=None, description="smallest inner product of a match"
@@ -34,14 +35,14 @@ def match_nearest(
     descriptors_b: NDArray[Any],
     options: NearestNeighbourOptions | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Match descriptors (N, D) and (M, D) of about equal lengths by the largest inner product.
+    """Match descriptors (N, D) and (M, D) of about equal norms by the largest inner product.
 
     Returns
     -------
     matches : int64 (K, 2), sorted by the first column; ties go to the smaller index.
     scores : float32 (K,), 1 minus the squared ratio of the best to the second-best distance (Lowe,
-        IJCV 2004, section 7.1), 0 without a second; better than the similarity
-        (docs/experiments/matching.md).
+        IJCV 2004, section 7.1), 0 if there is no second descriptor. This score ranks matches better
+        than the similarity (docs/experiments/matching.md).
     """
     options = options or NearestNeighbourOptions()
     a = np.ascontiguousarray(descriptors_a, dtype=np.float32)
@@ -72,9 +73,10 @@ def match_nearest(
 def _search(
     a: NDArray[np.float32], b: NDArray[np.float32], *, mutual: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Return each row's best column and value, each column's best value, and the second best.
+    """Return each row's best column and its value, each column's best value, and each row's
+    second-best column.
 
-    With ``mutual``, the second best is found only for rows that can still be mutual.
+    With ``mutual``, the latter is set only for rows whose match may still be mutual.
     """
     best = np.empty(len(a), dtype=np.int64)
     similarity = np.empty(len(a), dtype=np.float32)

@@ -1,5 +1,5 @@
 """Matching networks: SuperGlue (Sarlin et al., CVPR 2020), LightGlue (Lindenberger et al., ICCV
-2023) and LighterGlue, its small form for XFeat.
+2023) and LighterGlue, a smaller LightGlue for XFeat.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ PairOptions = TypeVar("PairOptions", bound=NetworkOptions)
 
 class PairNetwork(Checkpointed[PairOptions], ABC):
     def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
-        """Match two images; return rows int64 (K, 2), unique and sorted by a, and scores (K,)."""
+        """Match two images; return rows of keypoints int64 (K, 2), and scores (K,).
+
+        A keypoint has at most one match; matches are sorted by the first column.
+        """
         return self.match_many(a, [b])[0]
 
     @abstractmethod
@@ -59,7 +62,7 @@ class SuperGlueOptions(NetworkOptions):
 
     weights: str = Field(
         default="superglue_outdoor",
-        description="name or file: superglue_outdoor, superglue_indoor or one of the same layout",
+        description="superglue_outdoor, superglue_indoor, or a file with the same parameter names",
     )
     match_threshold: float = Field(default=0.2, ge=0, lt=1, description="smallest score of a match")
     sinkhorn_iterations: int = Field(default=100, gt=0)
@@ -92,7 +95,7 @@ def network_input(
 ) -> ImageKeypoints:
     """Convert an image's features for SuperGlue; ``where`` names the weights.
 
-    Raises DataError without scores in (0, 1], or for descriptors of another size.
+    Raises DataError if scores are missing or outside (0, 1], or descriptors have another size.
     """
     table = np.asarray(image.keypoints_px, dtype=np.float32)
     descriptors = np.asarray(image.descriptors, dtype=np.float32)
@@ -138,7 +141,10 @@ class LightGlueOptions(NetworkOptions):
 
 
 class LightGlue(PairNetwork[LightGlueOptions]):
-    """Matcher ``lightglue`` by kornia, for the features of its weights, without padding."""
+    """Matcher ``lightglue`` by kornia, for the features that its weights were trained on.
+
+    Each pair is matched separately, without padding.
+    """
 
     Options = LightGlueOptions
     _load: Any = staticmethod(load_lightglue)

@@ -13,19 +13,22 @@ from megloc_kapture.geometry.poses import CONVENTIONS, better_conventions
 from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
 from megloc_kapture.values import RigidTransform
 
-# largest Sampson distance as a share of the larger side, more than a degree: poses of depth sensors
-# have such errors
+# largest Sampson distance as a share of the longer side; more than a degree, since poses from depth
+# sensors have such errors
 _MAX_ERROR_SHARE = 0.02
-_AGREEING = 0.5  # the poses of a pair are right if this share of its matches fits them
+_AGREEING = 0.5  # the poses of a pair are correct if this share of its matches fits them
+# an image is wrong if a larger share of its pairs contradicts its pose, a map is wrong if a larger
+# share of its images is wrong
 _MOST = 0.5
 _FEW = 3  # a map is rejected only if at least this many images are compared
 
 
 @dataclass(frozen=True)
 class PairEvidence:
-    """Number of verified matches of a pair, and numbers of those that fit its poses.
+    """Matches of a pair that fit its poses.
 
-    The latter are for the poses as given, then for :data:`CONVENTIONS`.
+    ``num`` is the number of verified matches; ``fitting`` has the numbers of those that fit the
+    poses as given, then the poses converted from each of :data:`CONVENTIONS`.
     """
 
     image: str
@@ -90,8 +93,8 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
 def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
     """Return the images with contradicting poses, and the number of images with an agreeing pair.
 
-    A wrong pose also affects the pairs of images with right poses, so the worst image is removed
-    first, repeatedly. A single pair is no evidence against an image.
+    A wrong pose also affects the pairs with images whose poses are correct, so the worst image is
+    removed first, repeatedly. A single pair is no evidence against an image.
     """
     number = Counter(image for pair in pairs for image in (pair.image, pair.other))
     wrong: list[str] = []

@@ -1,7 +1,7 @@
 """Combination of the matches of a pair and of its variants, and of their keypoints.
 
-MegLoc, section "Guided pyramid matching": ALL is the union of the matches, MAX the matches of the
-variant that has most. A keypoint has at most one match per other image.
+MegLoc, section "Guided pyramid matching": ALL is the union of the matches; MAX has the matches of
+the variant with the most matches. A keypoint has at most one match per other image.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ class Combined:
     Attributes
     ----------
     matches, scores : int64 (K, 2) and float64 (K,).
-    best : variant with most matches; None if it has no more than the images themselves.
-    added : per image int64 (A, 2), variant and match index of each appended keypoint.
+    best : index of the variant with the most matches; None if it has no more than the originals.
+    added : per image int64 (A, 2), indices of the variant and of its match for each appended
+        keypoint.
     """
 
     matches: NDArray[np.int64]
@@ -52,9 +53,9 @@ def combine(
     """Combine the matches of a pair and its variants, and append their keypoints.
 
     The base matches (K, 2) come first. The variants follow by number of matches, their matches by
-    score; matches of used keypoints are skipped. With ``max``, the variant with most matches
-    replaces the base if it has more. The second image's keypoints may be None if it has no
-    variants.
+    score; matches of keypoints that already have a match are skipped. With ``max``, the variant
+    with the most matches replaces the base if it has more. The second image's keypoints may be None
+    if that image has no variants.
     """
     base_matches, base_scores = base
     order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))
@@ -66,7 +67,7 @@ def combine(
             alone.take(best, tried[best])
             if len(alone.matches) > len(base_matches):
                 return alone.result(best)
-            # merging identical keypoints has removed some of its matches
+            # merging identical keypoints has removed some of the variant's matches
             for union, length in zip(keypoints, lengths, strict=True):
                 if union is not None:
                     union.truncate(length)
@@ -91,7 +92,7 @@ class _Combination:
         self._added: tuple[list[tuple[int, int]], list[tuple[int, int]]] = ([], [])
 
     def take(self, number: int, tried: TriedVariant) -> None:
-        """Add those matches of a variant that join unused keypoints."""
+        """Add the matches of a variant between keypoints that have no match yet."""
         side, matched = tried
         union = self._keypoints[side]
         if union is None:
@@ -128,7 +129,7 @@ class _Combination:
 class KeypointUnion:
     """Base keypoints float32 (N, C), followed by added ones.
 
-    A keypoint within a pixel of existing keypoints is identical to the nearest of them.
+    A keypoint within a pixel of existing keypoints counts as identical to the nearest of them.
     """
 
     def __init__(self, base: Float32, added: Float32 | None = None) -> None:

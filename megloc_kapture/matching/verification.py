@@ -4,9 +4,10 @@ With known poses (mapping pairs): Sampson distance in pixels of the original ima
 meet in front of both cameras. Without (query pairs): LO-RANSAC of the relative pose by poselib with
 progressive sampling (Chum and Matas, CVPR 2005).
 
-With rays r = (x, y, 1) the epipolar constraint is C = r_b . E r_a. The distance is |C| over the
-norm of its derivatives by the four pixel coordinates, which use the derivative of the camera's
-projection (Hartley and Zisserman, Multiple View Geometry, eq. 4.13).
+With rays r = (x, y, 1) the epipolar constraint is C = r_b . E r_a = 0. The Sampson distance is |C|
+divided by the norm of the derivatives of C with respect to the four pixel coordinates, which
+include the derivative of the camera's projection (Hartley and Zisserman, Multiple View Geometry,
+eq. 4.13).
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ Floats = NDArray[np.float64]
 _MAX_RAY_ERROR_PX = 0.1  # largest error of a pixel converted to a ray and back
 _MIN_AGREEING = 0.5  # smallest share of a variant's matches that agree with the model
 _SAMPLE = 5  # matches that determine a relative pose
-_THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best one counts
-# this limit is strict, since matches on one object are not independent
+_THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best result counts
+# largest expected number of false alarms; strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
+# about the largest number of mismatched pairs that give the probability of a wrong match
 _MAX_WRONG_PAIRS = 20_000
 # a pair with fewer verified matches counts as not overlapping
 MIN_MATCHES = 15
@@ -68,10 +70,10 @@ def essential_matrix(b_from_a: RigidTransform) -> Floats:
 
 
 def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Floats) -> Floats:
-    """Return derivatives d (x, y) / d px (N, 2, 2) of rays (N, 3) by their pixels (N, 2).
+    """Return derivatives d (x, y) / d px (N, 2, 2) of rays (N, 3) at their pixels (N, 2).
 
-    NaN where the ray does not project to its pixel: the distortion has no inverse, or the ray of a
-    fisheye camera is sideways.
+    NaN where the ray does not project to its pixel: the distortion has no inverse, or the pixel of
+    a fisheye camera is 90 degrees or more off the optical axis.
     """
     from megloc_kapture.geometry.projection import project_with_jacobian
 
@@ -91,7 +93,7 @@ def sampson_error_px(
 ) -> Floats:
     """Return Sampson distances (N,) in pixels of matched rays (N, 3) with slopes (N, 2, 2).
 
-    Infinite without an epipolar line, NaN if a slope is.
+    Infinite where the epipolar line is undefined, NaN where a slope is NaN.
     """
     essential = essential_matrix(b_from_a)
     line_b = rays_a @ essential.T
@@ -106,7 +108,10 @@ def sampson_error_px(
 
 
 def in_front_of_both(rays_a: Floats, rays_b: Floats, b_from_a: RigidTransform) -> NDArray[np.bool_]:
-    """Return a mask (N,) of rays whose midpoint is in front of both cameras, or at infinity."""
+    """Return a mask (N,) of matched rays that meet in front of both cameras or are parallel.
+
+    Rays that do not intersect meet where they are closest to each other.
+    """
     rotation = b_from_a.rotation_matrix()
     a = rays_a / np.linalg.norm(rays_a, axis=1, keepdims=True)
     b = (rays_b / np.linalg.norm(rays_b, axis=1, keepdims=True)) @ rotation
@@ -114,7 +119,7 @@ def in_front_of_both(rays_a: Floats, rays_b: Floats, b_from_a: RigidTransform) -
     cosine = np.einsum("nd,nd->n", a, b)
     along_a, along_b = a @ center, b @ center
     determinant = 1.0 - cosine**2
-    # both depths carry the positive factor 1 / determinant: only the signs matter
+    # the factor 1 / determinant of both depths is positive and omitted: only the signs matter
     depth_a = along_a - cosine * along_b
     depth_b = cosine * along_a - along_b
     at_infinity = (determinant < 1e-10) & (cosine > 0)
@@ -167,7 +172,7 @@ def verify_two_view(
         return none
     focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
     best_first = {"progressive_sampling": True, "max_prosac_iterations": options.max_iterations}
-    # only the inliers are needed, which refinement does not change
+    # skip the refinement: only the inliers are needed, and it does not change them
     unrefined = {"max_iterations": 0}
     _, info = _ransac(rays_a[usable], rays_b[usable], focal, options, best_first, unrefined)
     inliers = np.asarray(info["inliers"], dtype=bool)
@@ -195,7 +200,8 @@ def two_view_of_variants(
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
 
     def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        # poselib's errors are at the mean focal length; a variant's are larger by its scale
+        # errors are measured at the mean focal length of the originals, where a pixel of a pair
+        # with a reduced variant is larger by this factor
         coarser = (focal + other_focal) / (_precision(features.variant) * focal + other_focal)
         return verify_two_view(
             features.keypoints_px[matches[:, 0], :2],
@@ -228,7 +234,7 @@ def two_view_of_variants(
         for each in matched:
             px = each.keypoints_px[:, :2]
             rays = bearing_rays(camera, px)
-            # pixels of a smaller image are larger angles
+            # a pixel of a smaller image covers a larger angle
             slopes = ray_slopes(camera, px, rays) / _precision(each.variant)
             others = each.other_rows
             good = verify_with_poses(
@@ -254,7 +260,7 @@ def known_pose_of_variants(
     other_from_image: RigidTransform,
     options: KnownPoseOptions,
 ) -> PairVerifier:
-    """Return a verifier by a known pose.
+    """Return a verifier that uses a known pose.
 
     ``other_rays`` (M, 3) and ``other_slopes`` (M, 2, 2) are those of the other image's keypoints.
     """
@@ -280,7 +286,8 @@ def relative_pose(
 ) -> RigidTransform | None:
     """Estimate ``other_from_image`` of matched rays (N, 3) by RANSAC, with a unit translation.
 
-    ``focal`` in pixels scales errors. None if no model has ``MIN_MATCHES`` inliers.
+    ``focal`` converts the errors of normalised coordinates to pixels. None if no model has
+    ``min_matches`` inliers.
     """
     if len(rays) < min_matches:
         return None
@@ -326,13 +333,13 @@ def agree_by_chance(
     num_matches: int,
     options: TwoViewOptions,
 ) -> bool:
-    """Return True if wrong matches may agree with a relative pose as well as these do.
+    """Return True if wrong matches may agree with a relative pose as well as these matches do.
 
-    Keypoints (N, 2) are the verified ones of ``num_matches``. RANSAC finds a model even for wrong
-    matches. The number of false alarms (Moisan and Stival, IJCV 2004) is the expected number of
-    models as good among wrong matches. Keypoints cluster on texture, so the probability of a wrong
-    match near its epipolar line is measured on mismatched pairs of the keypoints, and is at least
-    that of uniform positions.
+    Keypoints (N, 2) are those of the verified matches among ``num_matches``. RANSAC finds a model
+    even for wrong matches. The number of false alarms (Moisan and Stival, IJCV 2004) is the
+    expected number of equally good models of wrong matches. Keypoints cluster on texture, so the
+    probability that a wrong match is near its epipolar line is measured on mismatched pairs of the
+    keypoints; it is at least that of uniform positions.
     """
     from scipy.special import gammaln
     from scipy.stats import binom
@@ -360,7 +367,7 @@ def agree_by_chance(
     samples = gammaln(num_matches + 1) - gammaln(num_matches - _SAMPLE + 1) - gammaln(_SAMPLE + 1)
     for share in _THRESHOLDS:
         threshold_px = share * options.max_error_px
-        # probability for uniform positions; a Sampson error is of both images together
+        # probability for uniform positions; sqrt(2): a Sampson distance covers both images' errors
         anywhere = max(
             2 * math.sqrt(2) * threshold_px * math.hypot(c.width, c.height) / (c.width * c.height)
             for c in (camera_a, camera_b)

@@ -1,7 +1,8 @@
 """DeepLabV3+ trained on Cityscapes as a segmenter of people and vehicles.
 
 The network (Chen et al., ECCV 2018) has output stride 16, a ResNet-101 or MobileNetV2 backbone and
-the keys of VainF's checkpoints. As in all public checkpoints, the head has plain convolutions.
+the parameter names of VainF's checkpoints. As in all public checkpoints, the convolutions of the
+head are not depthwise separable.
 """
 
 from __future__ import annotations
@@ -54,12 +55,13 @@ class DeepLabOptions(NetworkOptions):
     weights: str = Field(
         default="deeplabv3plus-resnet101",
         description="deeplabv3plus-resnet101, deeplabv3plus-mobilenet, or a file; the backbone "
-        "is read from its keys",
+        "is recognized by its parameter names",
     )
     max_size_px: int = Field(
         default=2048,
         ge=64,
-        description="longer side of the network's input (2048 in Cityscapes); bounds the memory",
+        description="larger images are reduced to this longer side (2048 in Cityscapes), which "
+        "limits the memory",
     )
 
 
@@ -91,7 +93,7 @@ def _deeplab(tensors: Mapping[str, torch.Tensor], where: str) -> DeepLabV3Plus:
 
 
 def backbone_of(keys: Collection[str], where: str) -> Backbone:
-    """Return the backbone of a checkpoint by its keys."""
+    """Return the backbone of a checkpoint with these parameter names."""
     for key in keys:
         if key.startswith("backbone.layer1."):
             return "resnet101"
@@ -120,7 +122,7 @@ def _activated(
 
 
 class Pooling(nn.Sequential):
-    """Global average pooling and projection, expanded to the size of the map."""
+    """Global average pooling and projection, expanded to the size of the feature map."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
@@ -149,7 +151,7 @@ class AtrousPyramid(nn.Module):
 
 
 class Head(nn.Module):
-    """Classifier of the pyramid at 1/4 resolution, refined by low-level features."""
+    """Classifier of pyramid and low-level features, at 1/4 resolution."""
 
     def __init__(self, channels: int, low_level_channels: int, num_classes: int) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
 """Resizing and undistortion of images and masks, their cameras and their keypoints.
 
-Images are resampled once: undistortion averages a square of samples of the original per pixel,
-because undistorting first and resizing afterwards would blur twice.
+Images are resampled once, because undistorting first and resizing afterwards would blur twice: each
+pixel of an undistorted, reduced image is the average of a square of samples of the original.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ _CHECKED_EVERY = 16
 _INTERPOLATED_PX = 4
 # tolerance for points on the image border
 _ROUNDING_PX = 1e-6
-# residual of COLMAP's iterative undistortion
+# tolerance for the residual of COLMAP's iterative undistortion
 _SAME_PX = 1e-3
 Floats = NDArray[np.float64]
-# in these models distortion is a polynomial of the tangent, so zero coefficients mean no distortion
-# (unlike in fisheye models)
+# in these models distortion is a polynomial (or a ratio of two) of the tangent of the angle, so
+# zero coefficients mean no distortion (unlike in fisheye models)
 _POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
 Float32 = NDArray[np.float32]
 
@@ -72,12 +72,12 @@ def processed_image(image: NDArray[np.uint8], plan: FramePlan) -> NDArray[np.uin
 
 
 def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_]:
-    """Return the nearest-neighbour mask (H, W) of the processed image."""
+    """Resample a mask to the processed image, (H, W), by nearest neighbours."""
     size = (plan.processed.height, plan.processed.width)
     if not plan.changes_pixels:
         return mask
     if not plan.warps:
-        # OpenCV's nearest neighbour looks up the pixel's corner
+        # OpenCV's nearest neighbour is that of the pixel's corner, not of its centre
         rows, columns = (
             (2 * np.arange(number) + 1) * old_side // (2 * side)
             for number, old_side, side in zip(size, mask.shape, plan.resized[::-1], strict=True)
@@ -127,7 +127,7 @@ def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
     import cv2
 
     width, height = plan.processed.width, plan.processed.height
-    # maps are smooth: computed at the centres of blocks, and interpolated
+    # the coordinates vary smoothly: compute them at the centres of blocks, and interpolate
     square = max(1, round(_INTERPOLATED_PX / max(plan.shrink, 1.0)))
     columns, rows = -(-width // square) + 2, -(-height // square) + 2
     x, y = ((np.arange(number) - 0.5) * square for number in (columns, rows))
@@ -155,7 +155,9 @@ class FrameOptions(Options):
         gt=0,
         description="longer side of reduced images; unset: original size",
     )
-    upscale: bool = Field(default=False, description="also enlarge smaller images to this size")
+    upscale: bool = Field(
+        default=False, description="also enlarge images with a longer side below max_size_px"
+    )
     undistort: bool = Field(default=False, description="remove lens distortion")
 
 
@@ -163,8 +165,8 @@ class FrameOptions(Options):
 class FramePlan:
     """A camera before and after pre-processing; the pose does not change.
 
-    ``resized`` is (width, height) before the crop, ``shrink`` the original pixels per processed
-    pixel.
+    ``resized`` is (width, height) before the crop; ``shrink`` is the number of original pixels per
+    processed pixel, along a side.
     """
 
     original: Camera
@@ -247,11 +249,11 @@ def sees(camera: Camera, rays: Floats, points_px: Floats) -> NDArray[np.bool_]:
 def fitted_size(
     width: int, height: int, max_size_px: int, *, upscale: bool = False
 ) -> tuple[int, int]:
-    """Return the size with a larger side of ``max_size_px``; enlarge only with ``upscale``."""
+    """Return the size with a longer side of ``max_size_px``; enlarge only with ``upscale``."""
     larger = max(width, height)
     if larger <= max_size_px and not upscale:
         return width, height
-    # integer arithmetic, half up: float rounding could differ between machines
+    # round half up in integers: float rounding could differ between machines
     smaller = max(1, (2 * min(width, height) * max_size_px + larger) // (2 * larger))
     return (max_size_px, smaller) if width >= height else (smaller, max_size_px)
 

@@ -1,4 +1,4 @@
-"""Fixed masks, static regions of moving cameras (a car's bonnet), and margins around masks."""
+"""Fixed masks, static regions in images of a moving camera (a car's bonnet), and mask margins."""
 
 from __future__ import annotations
 
@@ -118,10 +118,10 @@ def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class UnchangingRegion:
-    """Static region below a frontier across the image; if empty, it is false and has a reason.
+    """Static region below a frontier across the image; an empty region is falsy and has a reason.
 
-    The frontier has a value per column, all of equal width: its distance from the top as a share of
-    the height, 1 in columns without a region.
+    The frontier has one value per column (columns have equal widths): its distance from the top as
+    a share of the height, 1 in columns without a region.
     """
 
     frontier: tuple[float, ...]
@@ -170,7 +170,7 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
         total, lengths, squares = total + directions, lengths + length, squares + length**2
         count += 1
     assert count >= MIN_IMAGES
-    # over all pairs of different images, sum dot products and products of lengths
+    # sums of dot products and of products of lengths over all pairs of different images
     agreeing = np.square(total).sum(axis=-1) - squares
     present = np.square(lengths) - squares
     wide, narrow = (

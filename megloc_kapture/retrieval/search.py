@@ -68,7 +68,7 @@ def common_length(sources: Sequence[VectorBlocks]) -> int:
 
 @dataclass(frozen=True)
 class FusedSearch:
-    """Search of the ``top_k`` best database rows by several features."""
+    """Search of the ``top_k`` best database rows by one or several global features."""
 
     top_k: int
     fusion: FusionOptions
@@ -77,11 +77,11 @@ class FusedSearch:
     def lists(
         self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
     ) -> list[Found]:
-        """Rank the rows: one ranking, or one per feature for fusion of ranks.
+        """Return one ranking of the rows, or one per feature if ranks are to be fused.
 
         ``queries`` and ``database`` have arrays (Q, D_i) and (M, D_i) per feature. A ranking has
-        indices int64 (Q, min(K, M)), best first, ties in the database's order, and scores float32;
-        K is ``top_k``, or more if ranks are fused.
+        indices int64 (Q, min(K, M)), best first, ties in database order, and scores float32; K is
+        ``top_k``, or more if ranks are to be fused.
         """
         if len(queries) == 0 or len(queries) != len(database):
             raise OptionError(
@@ -150,7 +150,7 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> Float3
 
 
 class _BestRows:
-    """Best ``top_k`` rows so far of each query: ``rows`` int64, -1 if fewer, ``scores`` float32."""
+    """Best ``top_k`` rows so far of each query: ``rows`` int64, -1 if unset, ``scores`` float32."""
 
     def __init__(self, num_queries: int, top_k: int) -> None:
         self.rows = np.full((num_queries, top_k), -1, dtype=np.int64)
@@ -170,7 +170,7 @@ class _BestRows:
 
 
 def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Return the ``count`` best of each row (q, b) and their columns; ties to the first."""
+    """Return the ``count`` best of each row (q, b) and their columns; of ties, the first."""
     height, width = scores.shape
     if width <= count:
         return scores, np.broadcast_to(np.arange(width), scores.shape)
@@ -187,7 +187,7 @@ def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]
 FusionMethod = Literal["ghm", "mean", "early", "reciprocal_rank"]
 _GAMMA = 0.5  # kapture-localization's default
 _RANK_CONSTANT = 60  # the value of Cormack et al.
-RANKED_IMAGES = 200  # length of the ranking per feature in reciprocal rank fusion
+RANKED_IMAGES = 200  # smallest length of the ranking per feature in reciprocal rank fusion
 Similarities = NDArray[np.floating[Any]]
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 
@@ -197,8 +197,8 @@ class FusionOptions(Options):
 
     method: FusionMethod = Field(
         default="ghm",
-        description="ghm: generalized harmonic mean; early: concatenated vectors; "
-        "reciprocal_rank: ranks",
+        description="ghm: generalized harmonic mean of the similarities; mean or early: their "
+        "weighted mean, as for concatenated vectors; reciprocal_rank: fusion of ranks",
     )
 
     def fuses_ranks(self) -> bool:
@@ -219,7 +219,7 @@ def fuse(
         return total
     with np.errstate(divide="ignore", over="ignore"):
         for matrix, share in zip(similarities, shares, strict=True):
-            # 1 / 0 is infinite and makes the mean zero
+            # 1 / 0 is infinite and makes the harmonic mean zero
             total += (1 / len(similarities)) / np.maximum(_GAMMA + share * matrix, 0)
         fused: Similarities = 1 / total
     fused -= _GAMMA
@@ -242,8 +242,8 @@ def fuse_rankings(
 ) -> Ranking:
     """Fuse ranked lists, int64 (Q, K_i) per feature, by their reciprocal ranks.
 
-    Returns indices int64 (Q, top_k), best first, -1 if exhausted, and sums float32, -inf where -1.
-    Ties keep the order of images.
+    Returns indices int64 (Q, top_k), best first, and sums float32. Where the lists have fewer
+    images, the index is -1 and the sum -inf. Ties are in the order of the indices.
     """
     shares = normalized_weights(weights, len(lists)).tolist()
     indices = np.full((len(lists[0]), top_k), -1, dtype=np.int64)
@@ -267,9 +267,10 @@ def greedy_coverage(
 ) -> tuple[list[int], list[int]]:
     """Choose images greedily by the number of matched keypoints that they add.
 
-    The number of matches would prefer neighbours of the best image. This is greedy maximum coverage
-    (Nemhauser, Wolsey and Fisher, 1978). ``keypoint_ids`` are each image's matched query keypoints.
-    Returns at most ``keep`` indices, and the number of keypoints that each adds.
+    A ranking by the number of matches would prefer neighbours of the best image. This is greedy
+    maximum coverage (Nemhauser, Wolsey and Fisher, 1978). ``keypoint_ids`` are the query keypoints
+    that each image matches. Returns at most ``keep`` indices of images, and the number of keypoints
+    that each of them adds.
     """
     size = max((int(ids.max()) + 1 for ids in keypoint_ids if len(ids)), default=0)
     missing = np.ones(size, dtype=bool)

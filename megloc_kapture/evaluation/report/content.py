@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 
 INTERVALS = "95 % confidence intervals of recall, queries taken as independent (%)"
 CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses (%)"
-# fewer queries are an example, not a measurement
+# the recall of fewer queries is an example, not a measurement
 FEW = 10
 _NAMES_SHOWN = 5
 _FALLBACK_POSES = {
     "retrieval": "of the best retrieved image",
-    "rig": "that another camera of the rig gives them",
+    "rig": "derived from another camera of the rig",
 }
 _MAX_WIDTH = 30
 _REASONS_SHOWN = 3
@@ -98,7 +98,7 @@ def notes(evaluation: Evaluation) -> list[str]:
         without = counted(row.num_fallback, "query")
         sentences.append(
             f"{without} could not be localized and got the pose {whose} instead; recall and the "
-            "median of all count it like any pose"
+            "median over all queries include these poses"
         )
     if row.num_missing == row.num_queries:
         sentences.append("no query has a pose")
@@ -130,7 +130,7 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
         )
     if confidence.num_wrong:
         by_inliers = confidence.area_by_inliers
-        than = "" if by_inliers is None else f", by the number of inliers {by_inliers:.4f}"
+        than = "" if by_inliers is None else f" ({by_inliers:.4f} if ranked by inliers)"
         sentences.append(
             f"calibration error {confidence.calibration_error:.3f}; area under risk against "
             f"coverage {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
@@ -151,7 +151,7 @@ def consistency_sentence(row: ConsistencyRow) -> str:
     return (
         f"{row.method}{frame} is used; {row.images} map images held out move by "
         f"{format_movement(row.moved_m, row.turned_deg)}, {row.moved_px:.1f} px (medians; claimed "
-        f"to {format_movement(row.claimed_m, row.claimed_deg)})"
+        f"accuracy {format_movement(row.claimed_m, row.claimed_deg)})"
     )
 
 
@@ -161,7 +161,7 @@ def format_movement(metres: float, degrees: float) -> str:
 
 def agreement_sentence(row: AgreementRow, results: WithoutTruth) -> str:
     if not row.num_only_first and not row.num_only_second:
-        return "The same queries have a pose in both."
+        return "The same queries have a pose in both results."
     first, second = results.evaluations[row.first].label, results.evaluations[row.second].label
     return (
         f"Only {first} has a pose for {counted(row.num_only_first, 'query')}, "
@@ -188,7 +188,10 @@ def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
     medians = (difference.first_m, difference.second_m)
     lost = [label for label, value in zip(pair, medians, strict=True) if math.isinf(value)]
     if lost:
-        return f"Most queries of {' and of '.join(lost)} have no pose, so there is no median."
+        return (
+            f"At least half of the queries of {' and of '.join(lost)} have no pose, so there is no "
+            "median."
+        )
     both = (
         f"The median position error is {format_metres(medians[0])} m for {pair[0]} and "
         f"{format_metres(medians[1])} m for {pair[1]}: {_signed(medians[0] - medians[1])} m"
@@ -237,7 +240,7 @@ def _signed(metres: float) -> str:
 
 
 def recall_table(evaluations: Sequence[Evaluation]) -> DataFrame:
-    """Return recall and medians; several results are below each other in each condition."""
+    """Return recall and medians, per condition one row for each result."""
     return _frame(
         {
             **label,
@@ -275,7 +278,7 @@ def _rows(evaluations: Sequence[Evaluation]) -> Iterator[tuple[dict[str, str], R
 
 
 def confident_table(evaluation: Evaluation) -> DataFrame | None:
-    """Return recall that counts doubtful poses as misses; None without confidences."""
+    """Return recall with poses of low confidence as misses; None without confidences."""
     rows = [
         {
             **_condition(row.name),
@@ -289,7 +292,7 @@ def confident_table(evaluation: Evaluation) -> DataFrame | None:
 
 
 def result_table(evaluation: Evaluation) -> DataFrame:
-    """Return localized share and inliers of a result without truth."""
+    """Return the share of localized queries, and their inliers, of a result without truth."""
 
     def inliers(name: str) -> str:
         quartiles = inliers_quartiles(evaluation, name)
@@ -352,7 +355,7 @@ def query_table(evaluation: Evaluation, queries: Sequence[QueryResult]) -> DataF
 
 
 def refinement_table(evaluation: Evaluation) -> DataFrame | None:
-    """Return the steps of pose refinement over all queries; None if nothing was refined."""
+    """Summarize pose refinement, one row per method; None if nothing was refined."""
     estimated, truth = evaluation.estimated, evaluation.truth
     by_method: dict[str, list[tuple[str, PoseRefinement]]] = {}
     for image, steps in sorted(evaluation.context.refinements.items()):
@@ -379,7 +382,7 @@ def refinement_table(evaluation: Evaluation) -> DataFrame | None:
 
 
 def as_text(frame: DataFrame) -> str:
-    """Format a table with left-aligned columns, two blanks apart."""
+    """Format a table with left-aligned columns, two spaces apart."""
     cells = frame.astype(str)
     form: dict[Any, Any] = {
         name: f"{{:<{max([len(str(name)), *column.str.len()]) + 1}}}".format

@@ -28,7 +28,7 @@ _BOX = (400, 300)
 _GAP_PX, _MAX_LINES = 6, 120
 # number of candidates compared to find the one with the most matches
 _CANDIDATES_COMPARED = 50
-# distance of a match from its epipolar line
+# largest distance of an agreeing match from its epipolar line
 _MAX_ERROR_PX = 8.0
 AGREES, DISAGREES, UNKNOWN = "#12a150", "#e02424", "#f2b705"
 
@@ -42,8 +42,8 @@ def worst_pictures(
 ) -> list[Picture]:
     """Draw queries next to the candidate with the most matches, else the nearest map image.
 
-    Images that are missing or broken are left out: a report without a picture is better than no
-    report.
+    Queries whose images are missing or broken are left out: a report without a picture is better
+    than no report.
     """
     pictures = []
     readers = _open_matches(context)
@@ -65,7 +65,7 @@ def _open_matches(context: ResultContext) -> _Readers | None:
     with contextlib.suppress(DataError):
         drawn = set(queries.types("keypoints")) & set(mapping.types("keypoints"))
         if known := [name for name in queries.types("matches") if name in drawn]:
-            # a guided pyramid includes the matches of its base type
+            # prefer a guided pyramid, which includes the matches of its base type
             chosen = min(known, key=lambda name: (base_type(name) == name, name))
             return queries.keypoints(chosen), mapping.keypoints(chosen), queries.matches(chosen)
     return None

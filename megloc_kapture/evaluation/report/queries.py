@@ -23,10 +23,10 @@ from megloc_kapture.localization.map_index import MapIndex, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
 
 NUM_SHOWN = 10
-# threshold of an inlier, as in pose estimation
+# inlier threshold, as in pose estimation
 INLIER_PX = 12.0
 _NOTHING = np.zeros((0, 2)), np.zeros((0, 3))
-# from right to wrong, distinct with any colour vision
+# from small to large errors; also distinct with a colour vision deficiency
 _SCALE = ("#4cc3f0", "#7fd17f", "#f4d35e", "#ff9f45", "#ff4d4d")
 NO_POSE_COLOR, UNKNOWN_COLOR = "#9aa5b1", "#c9a7ff"
 # lower bounds of confidence for these colours
@@ -51,7 +51,10 @@ def query_facts(query: QueryResult) -> list[str]:
 
 
 def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
-    """Return the queries with truth and colours, worst first; ``image`` is the dataset's name."""
+    """Return the queries with true poses and colours, worst first.
+
+    ``image`` is the image's name in the dataset, also for MLAD's pairs.
+    """
     shown = []
     for query in evaluation.queries:
         candidates = query.candidates
@@ -103,14 +106,14 @@ def frame_of_query(query: QueryResult, frames: Mapping[str, str]) -> str:
 
 
 def legend(queries: Sequence[QueryResult]) -> list[tuple[str, str]]:
-    """Return the colours in use and their meanings, from right to wrong."""
+    """Return the colours in use and their meanings, from best to worst."""
     used = {query.meaning: query.color for query in queries}
     order = [*_SCALE, UNKNOWN_COLOR, NO_POSE_COLOR]
     return [(used[m], m) for m in sorted(used, key=lambda m: order.index(used[m]))]
 
 
 def worst_queries(queries: Sequence[QueryResult]) -> list[QueryResult]:
-    """Return the first ten of ranked queries, half of them with a pose if possible."""
+    """Return the first ten of ranked queries, at least half of them with a pose if possible."""
     lost = [query for query in queries if query.cam_from_world is None]
     posed = [query for query in queries if query.cam_from_world is not None]
     num_posed = min(len(posed), max(NUM_SHOWN - len(lost), (NUM_SHOWN + 1) // 2))
@@ -138,7 +141,7 @@ class StoredInliers:
             return sources
         with contextlib.suppress(DataError):
             types = set(queries.types("matches"))
-            # a guided pyramid includes the matches of its base type
+            # skip the base type of a guided pyramid, which includes its matches
             types -= {base_type(name) for name in types if base_type(name) != name}
             for name in sorted(types & set(queries.types("keypoints"))):
                 index = index_map(mapping, type_in_map(mapping, name))
@@ -192,11 +195,12 @@ _AXIS_COSINE = float(np.cos(np.deg2rad(15.0)))
 def top_view(
     quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], tuple[str, str]]:
-    """Look down on cameras ``cam_from_world`` (N, 4) with centres (N, 3), N at least 1.
+    """Return the axes of a view from above, and their labels.
 
-    The vertical is the mean downward direction of the images, or if they disagree the direction of
-    least spread of the centres. Returns directions (2, 3) of the world that are right and up on
-    the page, orthonormal, and labels of these axes.
+    Parameters: quaternions of ``cam_from_world`` (N, 4) and camera centres (N, 3), N at least 1.
+    The vertical is the mean downward direction of the images; if these directions disagree, it is
+    the direction of least spread of the centres. The axes (2, 3) are orthonormal world directions
+    that point right and up on the page.
     """
     down = rotate(invert_quats(quats_wxyz), np.array([0.0, 1.0, 0.0])).mean(axis=0)
     length = float(np.linalg.norm(down))

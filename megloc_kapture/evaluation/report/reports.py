@@ -49,7 +49,7 @@ AGREEMENT_TEXT = "agreement.txt"
 PER_QUERY_CSV = "per_query.csv"
 REPORT_HTML, VIEW_HTML = "report.html", "view.html"
 _WIDTH = 92
-# rows of queries; per_query.csv has them all
+# largest number of rows in the page's list of queries; per_query.csv has all queries
 _MAX_ROWS = 500
 
 
@@ -62,9 +62,10 @@ def write_report(
 ) -> dict[str, Path]:
     """Write the files of a report and return name -> path.
 
-    These are recall.json and recall.txt (without truth agreement.json and agreement.txt),
-    per_query.csv, report.html, and for a single result view.html. The map's poses are by default
-    those of the first result with a map; ``provenance`` is JSON data, shown at the end.
+    The files are recall.json and recall.txt (without truth agreement.json and agreement.txt),
+    per_query.csv, report.html, and view.html for a single result. ``map_poses`` are by default
+    those of the first result with a map. ``provenance`` is JSON data, shown at the end of the page,
+    except its ``steps``: a table of the stages near the top.
     """
     name = "agreement" if isinstance(reported, WithoutTruth) else "recall"
     view = _view(reported)
@@ -96,7 +97,7 @@ def report_text(reported: Reported) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-# text and table of a report, either may be empty; the page adds figures and pictures
+# a text (may be empty) and a table (may be None); the page adds figures and pictures
 _Fact = tuple[str, "DataFrame | None"]
 
 
@@ -109,7 +110,7 @@ def _facts(reported: Reported) -> list[_Fact]:
     facts.append((f"recall (%) at {content.bounds(thresholds)}\n{criterion}", None))
     facts.append(("", content.recall_table(evaluations)))
     if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
-        text = "the same by the distance of the camera centres"
+        text = "the same by the distance between estimated and true camera centres"
         facts.append((text, content.recall_table(by_center)))
     facts.append((content.INTERVALS, content.interval_table(evaluations)))
     for evaluation in evaluations:
@@ -138,7 +139,7 @@ def _facts_without_truth(reported: WithoutTruth) -> list[_Fact]:
     for _, group in groupby(reported.agreement, key=lambda row: (row.first, row.second)):
         rows = list(group)
         heading = (
-            "% of all queries where both have a pose and the two are at most "
+            "% of all queries whose poses in both results are at most "
             f"{content.bounds(reported.thresholds)} apart"
         )
         facts.append((heading, content.agreement_table(reported, rows)))
@@ -300,8 +301,8 @@ def _error_curves(evaluations: Sequence[Evaluation]) -> Section:
     from megloc_kapture.evaluation.report import figures  # loads matplotlib
 
     explanation = (
-        "Share of all queries at or below an error, each error by itself; queries without a pose "
-        "keep the curves below 100 %. Dotted: the thresholds."
+        "Share of all queries at or below an error, separately for position and rotation; queries "
+        "without a pose keep the curves below 100 %. Dotted: the thresholds."
     )
     section = Section("Errors", [explanation])
     section.figure(figures.error_curves(evaluations))
@@ -324,19 +325,22 @@ def _sections_of(evaluation: Evaluation, map_poses: Poses, *, several: bool) -> 
     if evaluation.truth:
         inliers = Section(
             f"{whose}Error against inliers",
-            ["Errors should fall to the right: many inliers with a large error are a wrong place."],
+            [
+                "Errors should decrease to the right. A pose with many inliers and a large error "
+                "is typically in a wrong but similar location."
+            ],
         )
         inliers.figure(figures.errors_against_inliers(evaluation))
         sections += [inliers, _confidence(evaluation, whose)]
-    refined = Section(f"{whose}Changes by refinement", ["Of accepted poses; medians."])
+    refined = Section(f"{whose}Changes by refinement", ["Medians over the accepted poses."])
     refined.paragraphs += [
         _sentence(content.consistency_sentence(row)) for row in context.consistency
     ]
     refined.table(content.refinement_table(evaluation))
     which = "true" if evaluation.truth else "estimated"
     lines = (
-        f"Left the query, right the candidate with most matches. Green matches agree with the "
-        f"{which} pose, red ones are more than 8 pixels off their epipolar line."
+        f"Left: the query; right: the candidate with the most matches. Green matches agree with "
+        f"the {which} pose, red ones are more than 8 pixels from their epipolar line."
     )
     pictures = gallery.worst_pictures(worst_queries(queries), context, map_poses)
     sections += [refined, Section(f"{whose}The worst queries", [lines], pictures=pictures)]
@@ -358,7 +362,7 @@ def _confidence(evaluation: Evaluation, whose: str) -> Section:
 
     explanation = (
         "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses are "
-        "accepted from the most confident on."
+        "accepted in order of decreasing confidence."
     )
     section, confidence = Section(f"{whose}Confidence", [explanation]), evaluation.confidence
     if confidence is not None and confidence.num_poses >= content.FEW:
@@ -372,7 +376,7 @@ def _view(reported: Reported) -> str | None:
     if len(reported.evaluations) > 1:
         return None
     (evaluation,) = reported.evaluations
-    # a report without a view is better than none; `megloc view` reports what is broken
+    # a report without a view is better than none; `megloc view` reports the error
     with contextlib.suppress(DataError):
         inliers = StoredInliers(evaluation.context)
         scene = scene_of(evaluation.label or "Evaluation", inliers, shown_queries(evaluation))

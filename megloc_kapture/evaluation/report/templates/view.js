@@ -22,17 +22,17 @@
   const has = (array, i) => Number.isFinite(array[15 * i]);
   const pointFrames = bytes(data.pointFrames), cameraFrames = bytes(data.cameraFrames);
   const queryFrames = bytes(data.queryFrames);
-  let frame = 0, first = 0; // frames share no world, so one of them is drawn at a time
+  let frame = 0, first = 0; // frames have no common coordinates, so one is drawn at a time
   for (const query of queries) { query.first = first; first += query.drawn; }
 
-  // ---- the eye: it turns about a target, up is the map's
+  // ---- the virtual camera ("eye"): orbits a target; up is the vertical of the map
   const up = data.up;
   const east = unit(cross(Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0], up));
   const north = cross(up, east);
   const home = { target: [0, 0, 0], yaw: startYaw(), pitch: 0.5, distance: 1.9 * data.radius };
   let eye = { ...home }, flight = null, chosen = -1;
   function startYaw() {
-    // from behind the map's cameras, towards what they look at
+    // look in the mean viewing direction of the map's cameras
     let sum = [0, 0, 0];
     const n = cameraFrusta.length / 15;
     for (let i = 0; i < n; i++) for (let k = 1; k < 5; k++) sum = add(sum, vector(cameraFrusta, 5 * i + k));
@@ -57,10 +57,10 @@
     return new Float32Array(m);
   }
 
-  // ---- what is drawn: points, and lines whose ends are a centre and a ray of adjustable length
+  // ---- geometry: points, lines and faces; a vertex is a centre plus a ray of adjustable length
   const canvas = at("scene");
   const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
-  if (!gl) trouble("This browser has no WebGL 2, so there is no picture; the list works.");
+  if (!gl) trouble("This browser has no WebGL 2, so there is no picture; the list still works.");
   function trouble(text) { at("trouble").textContent = text; at("trouble").hidden = false; }
   const VERTEX = `#version 300 es
     layout(location=0) in vec3 centre; layout(location=1) in vec3 ray; layout(location=2) in vec4 color;
@@ -86,7 +86,7 @@
     line(a, b, color, alpha) { this.vertex(a, [0, 0, 0], color, alpha); this.vertex(b, [0, 0, 0], color, alpha); }
     frustum(array, i, color, alpha) {
       const c = centre(array, i), r = [1, 2, 3, 4].map((k) => vector(array, 5 * i + k));
-      // a roof over the upper edge says which way is up
+      // two lines above the upper edge, like a roof, show the up direction
       const top = add(add(r[0], r[1]), [0, 0, 0]).map((v, k) => v / 2 + (r[0][k] - r[3][k]) * 0.25);
       for (let k = 0; k < 4; k++) {
         this.vertex(c, [0, 0, 0], color, alpha); this.vertex(c, r[k], color, alpha);
@@ -115,7 +115,7 @@
   const uniform = {};
   if (gl) for (const name of ["view", "size", "dot_px"]) uniform[name] = gl.getUniformLocation(program, name);
   const usual = usualSize();
-  function usualSize() { // a part of the distance to the next camera, and of the whole
+  function usualSize() { // a part of the median distance to the nearest camera, limited by the size of the scene
     const all = [], array = cameraFrusta.length ? cameraFrusta : trueFrusta.length ? trueFrusta : frusta;
     const n = array.length / 15, step = Math.max(1, Math.floor(n / 200));
     for (let i = 0; i < n; i += step) {
@@ -131,7 +131,7 @@
   }
   const size = () => usual * 2 ** Number(at("size").value);
   const white = [1, 1, 1], red = [1, 0.3, 0.3], grey = [0.56, 0.65, 0.75];
-  let dots, cameras, lines, faces, allInliers, own = null; // own: of the chosen query
+  let dots, cameras, lines, faces, allInliers, own = null; // own: lines and inliers of the chosen query
   function cloud() {
     const mesh = new Mesh(gl.POINTS), colors = bytes(data.colors);
     const rows = new Float32Array(10 * points.length / 3);
@@ -187,14 +187,14 @@
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(program);
     gl.uniformMatrix4fv(uniform.view, false, matrix(eye, w / h));
-    const few = Math.min(Math.max(Math.sqrt(6e4 / points.length), 1), 2); // larger where they are few
+    const few = Math.min(Math.max(Math.sqrt(6e4 / points.length), 1), 2); // larger dots if there are few points
     gl.uniform1f(uniform.dot_px, 0.006 * few * data.radius * Math.min(w, h));
     const ticked = (id) => { const box = at(id); return box && box.checked; };
     if (ticked("show-points")) dots.draw();
     if (ticked("show-cameras")) cameras.draw();
     lines.draw();
     if (own) own.lines.draw(1.15);
-    gl.depthMask(false); // what can be seen through hides nothing
+    gl.depthMask(false); // transparent lines and faces do not hide others
     if (ticked("show-inliers")) allInliers.draw();
     if (own) own.inliers.draw();
     faces.draw();
@@ -223,8 +223,8 @@
     const said = q.facts.slice();
     if (q.condition) said.unshift(q.condition);
     if (posed && q.drawn) said.push(q.drawn + " inliers drawn");
-    if (!has(array, i)) said.push("nowhere to be drawn");
-    else if (!posed) said.push("drawn: its true pose");
+    if (!has(array, i)) said.push("not drawn: no pose");
+    else if (!posed) said.push("the true pose is drawn");
     const name = document.createElement("p");
     name.className = "name"; name.textContent = q.name;
     at("chosen").replaceChildren(name, ...said.map((text) => {
@@ -252,7 +252,7 @@
   // ---- mouse, fingers, keys
   const held = new Map();
   let moved = 0, pinch = null;
-  function nearest(x, y, reach) { // of what is drawn, by its centre and the middle of its image
+  function nearest(x, y, reach) { // nearest frustum, by its centre and the middle of its image
     const m = matrix(eye, canvas.clientWidth / canvas.clientHeight);
     let best = null, least = reach;
     const look = (array, i, kind) => {
@@ -372,7 +372,7 @@
     at("filter").addEventListener("input", list);
     at("order").addEventListener("change", list);
     list();
-    // view.html#query=NAME opens at a query
+    // view.html#query=NAME opens with that query chosen
     const named = /^#query=(.*)$/.exec(location.hash);
     const i = named ? queries.findIndex((q) => q.name === decodeURIComponent(named[1])) : -1;
     if (i >= 0) choose(i);
