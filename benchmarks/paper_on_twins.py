@@ -1,9 +1,9 @@
-"""The preset ``megloc`` on the four rendered twins, with the datasets' own files.
+"""The preset ``megloc`` on the four rendered twins, with the datasets' config files.
 
     .venv/bin/python benchmarks/paper_on_twins.py --wiring random --workspace W
     .venv/bin/python benchmarks/paper_on_twins.py --wiring free --dataset inloc
 
-``random``: seeded random weights in every official container. Each twin must run to its recall
+``random``: seeded random weights in the official file formats. Each twin must run to its recall
 table with every step of the paper that its data permit; disabled steps are printed with the reason.
 Random networks localize by chance, so the recall has no meaning.
 
@@ -16,9 +16,9 @@ reach 90 % within 0.25 m and 2 deg, 95 % within 0.5 m and 5 deg; InLoc's within 
 ``--rules`` repeats ``free`` with each of the paper's rules replaced by ours, one at a time and all
 together, and tabulates the recalls.
 
-By default the worlds have few images, and images and keypoint limits are reduced, so that a run
-takes an hour on two cores. ``--size images`` keeps the preset's image size and keypoint limits;
-``--size all`` also keeps the full worlds, for a GPU or a run overnight. Nothing else is changed.
+By default the worlds have few images, and image size and keypoint limits are reduced, so that a
+run takes an hour on two cores. ``--size images`` keeps the preset's image size and keypoint limits;
+``--size all`` also renders the full worlds, for a GPU or an overnight run. Nothing else is changed.
 Unknown arguments are passed to ``megloc eval``. Nothing is downloaded.
 """
 

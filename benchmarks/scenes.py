@@ -4,9 +4,8 @@
     .venv/bin/python benchmarks/scenes.py --read now.csv --against before.csv
 
 A scene is a folder with mapping/, query/ and query_gt/ in kapture, or with map/ (a
-prebuilt map), query/ and query_gt/. The seed affects the vocabulary, the verification of query
-pairs, triangulation and pose estimation. Unknown arguments are passed to ``megloc eval`` and
-``megloc localize``.
+prebuilt map), query/ and query_gt/. The seed affects VLAD's vocabulary and pose estimation. Unknown
+arguments are passed to ``megloc eval`` and ``megloc localize``.
 
 The comparison is paired by query: errors are averaged over the seeds, and the difference of these
 means is bootstrapped over the queries.

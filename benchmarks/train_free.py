@@ -8,9 +8,9 @@
 
 XFeat's weights are Apache-2.0 and the worlds are rendered by this project, so the trained weights
 may be published under a free licence. More data: ``--also FOLDER`` (kapture with depth),
-``--photographs FOLDER``. Output goes to ``runs/train_free``. The worlds are photograph albums like
-those of Aachen's twin, with seeds from 1000 (training) and 2000 (held out), which no test and no
-other benchmark uses.
+``--photographs FOLDER``. Output goes to ``runs/train_free``. The worlds are rendered like
+Aachen's twin, with seeds from 1000 (training) and 2000 (held out), which no test and no other
+benchmark uses.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def inliers(root: Path, scenes: Sequence[Path]) -> None:
     """Count matches within 3 px of the true epipolar line in pairs of real images with known poses.
 
     Each image of mapping/ is paired with the three nearest whose viewing direction is within 60
-    degrees. Printed are the number of inliers of all pairs and their share of the matches.
+    degrees. The function prints the number of inliers of all pairs and their share of the matches.
     """
     original: dict[str, object] = {"max_keypoints": 2048}
     night: dict[str, object] = {

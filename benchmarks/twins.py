@@ -4,7 +4,7 @@
 
 The rendered images are identical on every processor, but features and networks use
 processor-specific instructions, so keypoints differ in their last bits, and a query with barely
-enough inliers is localized on one machine and lost on another. The seed (vocabulary, triangulation,
+enough inliers is localized on one machine and not on another. The seed (of VLAD's vocabulary and of
 pose estimation) has an effect of similar size, so the range over seeds predicts the range over
 machines. Unknown arguments are passed to ``megloc eval``.
 """

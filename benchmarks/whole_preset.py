@@ -3,18 +3,19 @@
     .venv/bin/python benchmarks/whole_preset.py --workspace W
     .venv/bin/python benchmarks/whole_preset.py --wiring free --executor inline
 
-``random``: seeded random weights in every official container, added by ``megloc weights add
+``random``: seeded random weights in the official file formats, added by ``megloc weights add
 --unverified``, and the preset on a small rendered scene whose queries have depth; only sizes and
 scene-dependent options are changed. Random networks localize little or nothing, but each stage must
-run, report why it found nothing and write files that kapture can read. The refiners also run on the
-true poses displaced by 5 cm. The twins of the datasets run with the datasets' config files alone::
+run, report the reasons of failures and write files that kapture can read. The refiners also run on
+the true poses displaced by 5 cm. The twins of the datasets run with the datasets' config files
+alone::
 
     .venv/bin/python benchmarks/whole_preset_weights.py DIR
     MEGLOC_WEIGHTS=DIR make eval DATASET=synthetic-aachen PRESET=megloc    # or another twin
 
-``free``: the same wiring with freely licensed networks, and a minimum recall: 90 % of the queries
-within 0.25 m and 2 deg, 95 % within 0.5 m and 5 deg. The exit status is 1 below that. Weights are
-read from ../shared/data/weights if it exists, else from the user's folder.
+``free``: the same configuration with freely licensed networks, and a minimum recall: 90 % of the
+queries within 0.25 m and 2 deg, 95 % within 0.5 m and 5 deg. The exit status is 1 below that.
+Weights are read from ../shared/data/weights if it exists, else from the user's folder.
 
 Unknown arguments are passed to ``megloc eval``. Nothing is downloaded.
 """

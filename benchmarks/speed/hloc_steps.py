@@ -2,7 +2,7 @@
 
 ``hloc_side_by_side.py`` runs this with the Python of ``make hloc-env`` (pycolmap 3.13 and torch):
 ``python hloc_steps.py features|localize JOB.json``. hloc is not on PyPI. Like hloc, this code opens
-one HDF5 file of features and one of matches for every pair, computes the similarity matrix of a
+the HDF5 files of features and of matches for every pair, computes the similarity matrix of a
 pair with the best two of each row and column, verifies map matches by the epipolar distances of the
 known poses, triangulates with COLMAP from a database, and gathers 2D-3D matches in dictionaries for
 one RANSAC per query or per cluster of co-visible candidates. The data loader's worker processes,

@@ -4,7 +4,7 @@
 
 The map is a street in kapture files: each image has 4096 keypoints with short descriptors and sees
 1500 points, 10 million observations by default. It is generated once, deterministically, and kept
-in the cache folder; descriptors of images that are no candidates are sparse files. A new process
+in the cache folder; descriptors of images that are never candidates are sparse files. A new process
 opens the map and localizes queries with precomputed features and their 20 nearest images as
 candidates; matching and verification are timed.
 """

@@ -3,8 +3,7 @@
     .venv/bin/python benchmarks/speed/one_query.py --map WORKSPACE/map --scene SCENE
 
 The map is created by ``megloc eval kapture --root SCENE --workspace WORKSPACE``; the scene has
-query/ and query_gt/. Times are CPU seconds of one thread; the first query of each row is not
-counted.
+query/ and query_gt/. Times are CPU seconds of one thread, after a first query as warm-up.
 """
 
 from __future__ import annotations

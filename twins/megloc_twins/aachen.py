@@ -46,26 +46,26 @@ from megloc_twins.sparse_models import (
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import query_frames
 
-# the published model lies some hundred metres from its origin, with y down
+# the published model has y down, and is some hundred metres from the origin
 OFFICIAL_FROM_WORLD = settled_pose(
     np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.array([738.5, -6.25, -41.75])
 )
-NUM_UNLISTED = 2  # query images on disk that no list names
+NUM_UNLISTED = 2  # query images on disk that are in no list
 _PORTRAIT_SHARE = 1 / 6
-_YAWS_DEG = (0.0, 62.0, -62.0)  # photographs taken from about the same spot
-_DEVICES = ("nexus4", "milestone", "nexus4", "milestone", "nexus5x")  # by day, by turns
-_FILES = {  # parts of an image name: hour, minute, second, a running number
+_YAWS_DEG = (0.0, 62.0, -62.0)  # of the photographs taken from about the same spot
+_DEVICES = ("nexus4", "milestone", "nexus4", "milestone", "nexus5x")  # by day, in turn
+_FILES = {  # image names, formatted with hour, minute, second and a running number
     "day/nexus4": "IMG_20140520_{:02d}{:02d}{:02d}.jpg",
     "day/milestone": "2011-12-17_{:02d}-{:02d}-{:02d}_{}.jpg",
     "day/nexus5x": "IMG_20160914_{:02d}{:02d}{:02d}.jpg",
     "night/nexus5x": "IMG_20161227_{:02d}{:02d}{:02d}.jpg",
     "night/nexus5x_additional_night": "IMG_20180115_{:02d}{:02d}{:02d}.jpg",
 }
-_WRONG_IMAGE = 1228  # db/1228.jpg has a wrong pose in the published model, not here
+_WRONG_IMAGE = 1228  # not used: db/1228.jpg has a wrong pose in the published model
 
 
 class AachenTwinOptions(ModelTwinOptions):
-    """Contents of Aachen's twin; the defaults are what ``make eval`` localizes in."""
+    """Contents of Aachen's twin; ``make eval`` uses the defaults."""
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
     stations_per_place: int = Field(
@@ -84,15 +84,14 @@ class AachenTwinOptions(ModelTwinOptions):
 
 
 class AachenTwin(SyntheticDataset[AachenTwinOptions]):
-    """Aachen Day-Night v1.1 as it is published, which holds v1.0, with its truth.
+    """Aachen Day-Night v1.1 in its published layout, which includes v1.0, with true poses.
 
     ``images_upright/``, ``3D-models/`` (v1.0's NVM, its list and ``database_intrinsics.txt``;
     ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
-    of the original: database images are numbered without order and the NVM has an order of its
-    own, features of the NVM are not numbered densely, v1.1's night list replaces
-    v1.0's, lists end without a line end, and some images below ``query/`` are in no list. With
-    ``model_features`` also ``aachen.db``, the features of v1.0's model; none of v1.1's are
-    published.
+    of the original: numbers of database images are unordered, the NVM has another order, feature
+    numbers in the NVM have gaps, v1.1's night list replaces v1.0's, lists lack the last line break,
+    and some images below ``query/`` are in no list. With ``model_features`` also ``aachen.db``, the
+    features of v1.0's model; v1.1's features are not published.
     """
 
     Options = AachenTwinOptions
@@ -128,12 +127,12 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
 
 @dataclass(frozen=True, eq=False)
 class AachenFrames:
-    """All images of the twin, queries in the order of the lists; poses in the world's frame."""
+    """All images of the twin, queries in the order of the lists, with poses in the world."""
 
-    database: tuple[Frame, ...]  # map images with a camera each, in the order of the NVM
-    sequences: tuple[Frame, ...]  # map images, those of a sequence with one sensor
+    database: tuple[Frame, ...]  # map images with separate cameras, in the order of the NVM
+    sequences: tuple[Frame, ...]  # map images, with one sensor per sequence
     day: tuple[Frame, ...]
-    night: tuple[Frame, ...]  # v1.0's, then those that v1.1 adds
+    night: tuple[Frame, ...]  # queries of v1.0, then those added by v1.1
     unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
 
     def mapping(self) -> tuple[Frame, ...]:
@@ -146,7 +145,7 @@ class AachenFrames:
 
 
 def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
-    """Choose all images of the twin; equal options give equal images."""
+    """Choose all images of the twin, deterministically."""
     world = options.world()
     numbers = _database_numbers(options)
     database: list[Frame] = []
@@ -192,7 +191,7 @@ def _photographs(
     suns = [(rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(40, 60))) for _ in range(2)]
     frames: list[Frame] = []
     for station, (spot, heading) in enumerate(place.plan.stops(options.stations_per_place)):
-        # of one place, those of a day behind one another: its shadows are cast once
+        # photographs of a day are consecutive, so that its shadow map is computed once
         sun = suns[2 * station // options.stations_per_place]
         for yaw_deg in _YAWS_DEG:
             number = int(numbers[len(frames)])
@@ -205,7 +204,7 @@ def _photographs(
 
 
 def _sequence(options: AachenTwinOptions, place: Place) -> list[Frame]:
-    """Return a sequence: a few steps through a place with one camera, looking to the left."""
+    """Return a sequence: a few images along the path of a place, by one camera facing left."""
     rng = stream(options.seed, "aachen", "sequence", place.index)
     sun = (float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60))))
     width, height = options.width, options.height
@@ -237,8 +236,8 @@ def _map_frame(
     sun: tuple[float, float],
     rng: np.random.Generator,
 ) -> Frame:
-    """Return a hand-held image from ``at`` (place's frame, metres), named after itself and its
-    sensor."""
+    """Return a hand-held image at a position (place's frame, metres); ``names`` are those of the
+    image and of its sensor."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
     return Frame(
         name=names[0],
@@ -258,7 +257,7 @@ def _map_frame(
 def _photo_camera(
     options: AachenTwinOptions, rng: np.random.Generator, *, portraits: bool = True
 ) -> Camera:
-    """Draw a SIMPLE_RADIAL camera with a central principal point; some are portraits."""
+    """Draw a SIMPLE_RADIAL camera with a central principal point, some in portrait format."""
     width, height = options.width, options.height
     focal, k = rng.uniform(0.7, 0.9) * width, rng.uniform(-0.1, 0.02)
     if rng.random() < _PORTRAIT_SHARE and portraits:
@@ -275,7 +274,7 @@ def _simple_radial(width: int, height: int, focal: float, k: float) -> Camera:
 def _as_telephones(
     frames: Sequence[Frame], condition: Condition, options: AachenTwinOptions
 ) -> list[Frame]:
-    """Return queries sorted by number, with device names as in the lists."""
+    """Return the queries sorted by number, with names of phones as in the lists."""
     renamed = []
     for number, frame in enumerate(sorted(frames, key=lambda frame: frame.timestamp)):
         focal, _, _, k = frame.camera.params
@@ -285,7 +284,7 @@ def _as_telephones(
         else:
             added = "_additional_night" if number >= options.night_queries else ""
             folder, first_hour = f"night/nexus5x{added}", 18
-        second = 37 * number  # each was taken at another time
+        second = 37 * number  # so that times differ
         clock = first_hour + second // 3600, second // 60 % 60, second % 60
         name = f"query/{folder}/{_FILES[folder].format(*clock, 257 + number)}"
         renamed.append(replace(frame, name=name, camera=camera))
@@ -295,11 +294,11 @@ def _as_telephones(
 def _write_nvm_model(
     folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
 ) -> None:
-    """Write v1.0's model, with focal lengths only, and the list of complete cameras."""
+    """Write v1.0's NVM, which has only focal lengths, and the list of complete cameras."""
     rng = stream(options.seed, "aachen", "points", "1.0")
     points = drawn.points(frames, rng)
     if not drawn.features:
-        # as if the images had more features than see a point
+        # as if some features observed no point
         points = replace(points, feature_ids=3 * points.feature_ids + 1)
     cameras = {frame.name: frame.camera for frame in frames}
     write_nvm(folder / "aachen_cvpr2018_db.nvm", nvm_model(list(cameras), frames, points))
@@ -310,7 +309,7 @@ def _write_nvm_model(
 def _write_colmap_model(
     folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
 ) -> None:
-    """Write v1.1's model: image and camera ids are unordered, and a sequence shares its camera."""
+    """Write v1.1's model: image and camera ids are unordered, and a sequence shares a camera."""
     rng = stream(options.seed, "aachen", "points", "1.1")
     frames = [frames[index] for index in rng.permutation(len(frames))]
     cameras = {frame.sensor_id: frame.camera for frame in frames}

@@ -18,9 +18,9 @@ Box = tuple[int, int, int, int]  # x0, y0, x1, y1, texels
 Colour = NDArray[np.float32]  # (3,), 0..255
 Picture = NDArray[np.float32]  # (H, W, 3), 0..255
 TILE = 512  # texels; the period of a material
-_FINE = 16  # OpenCV's drawing functions take positions in parts of a texel
-_SMOOTH = cv2.LINE_AA, 4  # the last arguments of those: the edges' kind, bits of the parts
-_MATERIALS = {  # colour, and the least factor on each of its channels
+_FINE = 16  # OpenCV's drawing functions get positions in sixteenths of a texel
+_SMOOTH = cv2.LINE_AA, 4  # their last arguments: antialiasing, fractional bits of positions
+_MATERIALS = {  # colour, and the smallest random factor of each channel
     "brick": ((150, 84, 66), 0.8),
     "stone": ((172, 160, 136), 0.85),
     "plaster": ((196, 176, 138), 0.75),
@@ -28,8 +28,8 @@ _MATERIALS = {  # colour, and the least factor on each of its channels
     "asphalt": ((104, 104, 106), 1.0),
 }
 _STAINS = {"stone": (0.07, 24, 2), "plaster": (0.08, 64, 3), "asphalt": (0.14, 24, 2)}
-# rows and columns of blocks in a tile, every second row shifted by half a block; spread of their
-# tones; width of the joints, texels, and their grey
+# rows and columns of blocks in a tile (every second row is shifted by half a block); spread of the
+# blocks' tones; width of the joints in texels, and their grey level
 _MASONRY: dict[str, tuple[int, int, float, float, float]] = {
     "brick": (30, 12, 0.16, 1.2, 168.0),
     "stone": (12, 6, 0.12, 1.5, 92.0),
@@ -40,8 +40,8 @@ _MASONRY: dict[str, tuple[int, int, float, float, float]] = {
 def smooth_noise(
     rng: np.random.Generator, height: int, width: int, *, cell: float, octaves: int = 4
 ) -> Field2D:
-    """Return multi-octave noise of zero mean and unit deviation; ``cell`` is the coarsest octave,
-    texels."""
+    """Return multi-octave noise of zero mean and unit standard deviation; ``cell`` is the cell size
+    of the coarsest octave, texels."""
     total = np.zeros((height, width), np.float32)
     amplitude = 1.0
     for _ in range(octaves):
@@ -74,7 +74,7 @@ def periodic_noise(
 def random_colour(
     rng: np.random.Generator, low: float = 30, high: float = 225, *, chroma: float = 0.75
 ) -> Colour:
-    """Draw a random colour; ``chroma`` 0 is grey, 1 the strongest in range."""
+    """Draw a random colour; ``chroma`` 0 gives grey, 1 the strongest colours of the range."""
     channels = rng.uniform(low, high, 3)
     return (channels.mean() + chroma * (channels - channels.mean())).astype(np.float32)
 
@@ -155,7 +155,7 @@ def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
 
 
 def _blocks(rng: np.random.Generator, base: Colour, kind: str) -> Picture:
-    """Draw a tile of blocks."""
+    """Draw a tile of masonry blocks."""
     rows, cols, spread, joint, joint_grey = _MASONRY[kind]
     y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
     v = (y + 0.5) / TILE * rows
@@ -193,7 +193,7 @@ def material_tile(kind: str, seed: int) -> Picture:
 
 
 def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> Picture:
-    """Return a surface (height, width, 3) of the material, its tile moved by ``shift`` rows,
+    """Return a surface (height, width, 3) of the material; ``shift`` moves the tile by rows and
     columns."""
     tile = np.roll(material_tile(kind, seed), shift, axis=(0, 1))
     repeats = (-(-height // TILE), -(-width // TILE), 1)

@@ -1,7 +1,7 @@
 """The rendered world in 4Seasons' layout: three recordings of one route, with true poses.
 
-The map is recorded on a summer day. Queries are from winter, with published poses, and from dusk,
-with poses that a challenge withholds. Relocalization files list the query keyframes.
+The map is recorded on a summer day. Queries are recorded in winter, with published poses, and at
+dusk, with poses that are withheld as in a challenge. Relocalization files list the query keyframes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ WINTER = "recording_2021-01-15_13-04-17"
 DUSK = "recording_2021-03-22_18-41-05"
 
 _EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
-_GREY = np.array([299, 587, 114])  # thousandths
+_GREY = np.array([299, 587, 114])  # weights of R, G and B, thousandths
 
 _TAGS = "translation vector, rotation quaternion"
 
@@ -48,11 +48,11 @@ def _settled_earth_from_enu(
     latitude_deg: float, longitude_deg: float, height_m: float
 ) -> RigidTransform:
     exact = earth_from_enu(latitude_deg, longitude_deg, height_m)
-    # to the micrometre: at the earth's surface a float64 holds no nanometres
+    # rounded to micrometres: ECEF coordinates have less than nanometre precision in float64
     return settled_pose(exact.rotation_matrix(), np.round(exact.translation, 6))
 
 
-# the world's origin: near Munich, its axes east, north and up
+# the world's origin is near Munich, its axes are east, north and up
 EARTH_FROM_WORLD = _settled_earth_from_enu(48.1861, 11.6197, 540.0)
 
 
@@ -61,13 +61,13 @@ class FourSeasonsTwinOptions(TwinOptions):
 
     num_places: int = Field(default=4, ge=1, description="places on the route")
     map_keyframes: int = Field(
-        default=12, ge=3, description="keyframes of the map's recording in each place"
+        default=12, ge=3, description="keyframes of the map recording in each place"
     )
     winter_keyframes: int = Field(
-        default=6, ge=1, description="keyframes of the winter's recording in each place"
+        default=6, ge=1, description="keyframes of the winter recording in each place"
     )
     dusk_keyframes: int = Field(
-        default=4, ge=1, description="keyframes of the recording at dusk in each place"
+        default=4, ge=1, description="keyframes of the dusk recording in each place"
     )
     width: int = Field(default=800, ge=64, description="image width in px")
     height: int = Field(default=400, ge=48, description="image height in px")
@@ -82,7 +82,7 @@ class FourSeasonsTwinOptions(TwinOptions):
 
 
 class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
-    """4Seasons as it is published, with its truth.
+    """4Seasons in its published layout, with true poses.
 
     ``calibration/``, three recordings, relocalization files as in 2021, and the true poses (ECEF)
     in ``ground_truth/``.
@@ -116,7 +116,7 @@ def _write_recording(
     root: Path, options: FourSeasonsTwinOptions, drive: Drive, moments: list[Moment], work: Work
 ) -> None:
     folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
-    published = drive.name != DUSK  # the poses of a challenge's test recording are withheld
+    published = drive.name != DUSK  # poses of test recordings are withheld
     keyframes = [moment for moment in moments if moment.keyframe]
     render_frames(
         options.world(),
@@ -126,7 +126,7 @@ def _write_recording(
         sky_seed=drive.sky_seed(options.seed),
         work=work,
     )
-    times = (moment.timestamp for moment in moments)  # most without images
+    times = (moment.timestamp for moment in moments)  # most have no images
     rows = [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
     write_lines(folder / "times.txt", rows)
     if not published:
@@ -155,11 +155,11 @@ def _on_earth(moments: Iterable[Moment]) -> Iterator[Frame]:
 
 @dataclass(frozen=True)
 class SlamFrames:
-    """How a recording's frames lie to one another; all as its files have them.
+    """Transforms between a recording's coordinate frames, as in its files.
 
     Parameters
     ----------
-    s_from_as, w_from_gpsw, e_from_gpsw : as in ``Transformations.txt``.
+    s_from_as, w_from_gpsw, e_from_gpsw : named as in ``Transformations.txt``.
     scale : metres per unit of the SLAM world.
     """
 
@@ -172,7 +172,7 @@ class SlamFrames:
     def drawn(cls, seed: int, recording: str) -> SlamFrames:
         """Draw the coordinate frames of a recording."""
         rng = stream(seed, "frames", recording)
-        # each scene has its own origin, some hundred metres away
+        # the scenes of different recordings have origins some hundred metres apart
         east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
         origin = RigidTransform((1.0, 0.0, 0.0, 0.0), (east, north, up))
         place = geodetic(np.array((EARTH_FROM_WORLD @ origin).translation))
@@ -209,7 +209,7 @@ def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
 
 
 def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
-    """Format poses, below a header with one more column than the rows."""
+    """Format poses below a header, which has a column more than the rows, as published."""
     lines = [
         "# timestamp_ns, tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, "
         "fusion_quality, v3"
@@ -263,8 +263,8 @@ def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]
 def _random_transform(
     rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
 ) -> RigidTransform:
-    """Draw a rotation about z by up to ``yaw`` and about x and y by up to ``tilt`` radians, and a
-    translation."""
+    """Draw a translation, and a rotation by up to ``yaw`` about z and ``tilt`` about x and y,
+    radians."""
     ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
     cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
     sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()

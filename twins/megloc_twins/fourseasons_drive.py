@@ -1,4 +1,4 @@
-"""A car with a stereo camera drives through the places, in three seasons."""
+"""Drives of a car with a stereo camera through the places, in three seasons."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from megloc_twins.moving_objects import FloorPlan, place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
 from megloc_twins.squares import Place, build_place
 
-# of the published recordings: pixels of an image 800 wide and 400 high, metres
+# calibration of the published recordings: pixels for images of 800x400, and metres
 _FOCAL_PX, _CENTRE_PX = 501.4757919305817, (421.7953735163109, 167.65799492501083)
 _PUBLISHED_SIZE = (800, 400)
 CAM1_FROM_CAM0 = RigidTransform((1.0, 0.0, 0.0, 0.0), (-0.3004961618953472, 0.0, 0.0))
 
 _CAMERA_HEIGHT_M = 1.6
-_LOOK_AHEAD_M = 2.0  # the car turns into a corner before it
-_STEP_M = 0.17  # between frames that follow one another
+_LOOK_AHEAD_M = 2.0  # the car begins to turn before a corner
+_STEP_M = 0.17  # between consecutive frames
 _FRAME_NS = 33_333_337
-_FRAMES_PER_KEYFRAME = 3  # the keyframe, and those that follow it
-_EXTRA_EVERY = 8  # keyframes; of one frame that follows the images are kept too
+_FRAMES_PER_KEYFRAME = 3  # the keyframe and the frames after it
+_EXTRA_EVERY = 8  # after every 8th keyframe, the next frame also has images
 _MARGIN_M = 0.35
 
 Season = Literal["summer", "winter", "dusk"]
@@ -45,9 +45,9 @@ _DUSK_EXPOSURE = 0.65
 
 @dataclass(frozen=True)
 class Moment:
-    """The car at one moment, a keyframe of the odometry or not; ``timestamp`` in nanoseconds.
+    """The car at a ``timestamp`` in nanoseconds, which may be a keyframe of the odometry.
 
-    ``frames`` are its cameras' images, empty if they were not kept.
+    ``frames`` are the images of both cameras; empty if the recording has none of this moment.
     """
 
     timestamp: int
@@ -60,12 +60,12 @@ class Moment:
 class Drive:
     """A recording: route, time and appearance."""
 
-    name: str  # with its time
-    season: Season  # light, and what lies on the ground
+    name: str  # contains the time
+    season: Season  # determines light and ground
     keyframes_per_place: int  # at equal distances along a place's path
     role: Role  # of its images
-    lateral_m: float  # deviation from the path, up to this
-    turn_deg: float  # deviation from its direction, up to this
+    lateral_m: float  # largest lateral deviation from the path
+    turn_deg: float  # largest deviation from the path's direction
 
     @property
     def start_ns(self) -> int:
@@ -74,9 +74,9 @@ class Drive:
         return int(moment.timestamp()) * 10**9
 
     def sky_seed(self, seed: int) -> int:
-        """Return the seed of the clouds and of the dirt on the bonnet, which differs by season.
+        """Return the seed of clouds and of dirt on the bonnet, which differs by season.
 
-        With the same dirt in map and queries, the bonnet would be the best match.
+        If map and queries had the same dirt, the bonnet would yield the best matches.
         """
         return seed + (get_args(Season).index(self.season) << 32)
 
@@ -89,7 +89,7 @@ def stereo_camera(width: int, height: int) -> Camera:
 
 
 def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
-    """Return the frames of a drive through all places, in order of time."""
+    """Return the moments of a drive through all places, in order of time."""
     rng = stream(options.seed, "drive", drive.name)
     moments = []
     clock = drive.start_ns
@@ -104,7 +104,7 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
             pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
             for step in range(_FRAMES_PER_KEYFRAME):
                 clock += _FRAME_NS + int(rng.integers(-40_000, 40_000))
-                # the published times have been floats of seconds
+                # published timestamps were rounded by a conversion to float seconds
                 timestamp = int(clock / 1e9 * 1e9)
                 spot, heading = _beside(place.plan, along + step * _STEP_M, lateral)
                 position = np.array([*spot, _CAMERA_HEIGHT_M])
@@ -114,12 +114,12 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
                 if step == 0 or (step == 1 and stop % _EXTRA_EVERY == 1):
                     frames = _frames(options, drive, place, timestamp, pose, position, sun, rng)
                 moments.append(Moment(timestamp, pose, step == 0, frames))
-        clock += 20_000_000_000  # the way to the next place was not recorded
+        clock += 20_000_000_000  # the drive to the next place is not recorded
     return moments
 
 
 def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
-    """Return a place with other leaves, patches and markings, on wet asphalt."""
+    """Return a place in winter: other leaves, patches and markings, on wet asphalt."""
     place = build_place(options, index)
     seed = seed_of(options.seed, "winter", index)
     recipes = []
@@ -134,7 +134,7 @@ def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
 def _lighting(season: Season, rng: np.random.Generator, sun: tuple[float, float]) -> Lighting:
     if season == "dusk":
         night = night_lighting(rng, exposure=_DUSK_EXPOSURE)
-        # lamps are on, and the sky still gives a little light
+        # the lamps are on, and the sky is still slightly bright
         light = float(rng.uniform(*_DUSK_SKY))
         sky = (0.85 * light, 0.95 * light, 1.25 * light)
         return replace(night, sky=sky, sky_colour=sky)

@@ -31,18 +31,18 @@ class Lighting:
 
     condition: Condition = "day"
     sun_direction: Triple = _UP  # unit vector towards the sun
-    sun: Triple = _DARK  # on a surface that faces it
-    sky: Triple  # from above; surfaces that look down get less
-    lamps: Triple = _DARK  # at one metre of a lamp; zero by day
-    glow: Triple = _DARK  # of surfaces that glow themselves
+    sun: Triple = _DARK  # on a surface that faces the sun
+    sky: Triple  # on a surface that faces up; others get less
+    lamps: Triple = _DARK  # at a distance of one metre; zero by day
+    glow: Triple = _DARK  # of surfaces that emit light
     sky_colour: Triple = _DARK  # radiance
-    cloud_shift: float = 0.0  # turn of the clouds, radians
+    cloud_shift: float = 0.0  # rotation of the clouds, radians
     exposure: float  # factor between radiance and the sensor's signal, where 1 saturates
-    white_balance: Triple  # gain, the colour cast
-    shot_noise: float = 4e-5  # variance of the signal per signal
-    read_noise: float = 0.002  # deviation of the signal in the dark
-    blur_px: float = 0.5  # deviation of the Gaussian blur of lens and hand
-    vignetting: float  # loss of light in the corner, 0..1
+    white_balance: Triple  # gain per channel
+    shot_noise: float = 4e-5  # variance of the signal divided by the signal
+    read_noise: float = 0.002  # standard deviation of the signal in the dark
+    blur_px: float = 0.5  # standard deviation of the Gaussian blur by lens and motion
+    vignetting: float  # loss of light in the corners, 0..1
 
 
 def _triple(values: NDArray[np.float64]) -> Triple:
@@ -58,7 +58,7 @@ def day_lighting(
     Parameters
     ----------
     sun : azimuth and elevation, radians, in the place's frame.
-    overcast : 0..1, how much clouds dim the sun.
+    overcast : 0..1, attenuation of the sun by clouds.
     """
     azimuth, elevation = sun
     cos = np.cos(elevation)
@@ -76,7 +76,7 @@ def day_lighting(
 
 
 def night_lighting(rng: np.random.Generator, *, exposure: float) -> Lighting:
-    """Return night light: warm lamps, a little blue from the sky, a slow and noisy sensor."""
+    """Return night light: warm lamps, a faint blue sky, a noisy sensor and more blur."""
     return Lighting(
         condition="night",
         lamps=_triple(np.array([1.0, 0.74, 0.42]) * rng.uniform(0.8, 1.2)),
@@ -114,12 +114,12 @@ class Weather:
     """Light and lens of a traversal."""
 
     elevation_deg: float | None  # of the sun above the horizon; None at night
-    overcast: float = 0.0  # 0..1, how much clouds dim the sun
-    tint: Triple = (1.0, 1.0, 1.0)  # on the sun's light by day, on the white balance at night
-    cast: Triple = (1.0, 1.0, 1.0)  # on the white balance by day
-    brightness: float = 1.0  # factor on the exposure
-    blur_px: float | None = None  # deviation, of lens, drops and motion; None: the lighting's own
-    noise: float = 1.0  # factor on the variance of the sensor's noise
+    overcast: float = 0.0  # 0..1, attenuation of the sun by clouds
+    tint: Triple = (1.0, 1.0, 1.0)  # factor of the sun's light by day, of white balance at night
+    cast: Triple = (1.0, 1.0, 1.0)  # factor of the white balance by day
+    brightness: float = 1.0  # factor of the exposure
+    blur_px: float | None = None  # blur by lens, drops and motion; None: as in the lighting
+    noise: float = 1.0  # factor of the sensor noise's variance
 
 
 WEATHERS: dict[str, Weather] = {
@@ -138,7 +138,7 @@ WEATHERS: dict[str, Weather] = {
 def road_lighting(
     condition: str, rng: np.random.Generator, *, azimuth: float, night_exposure: float = 1.0
 ) -> Lighting:
-    """The lighting of one image of a traversal.
+    """Return the lighting of an image of a traversal.
 
     Parameters
     ----------
@@ -175,8 +175,8 @@ def looking_at(
 ) -> RigidTransform:
     """Return ``cam_from_world`` of a camera at ``position`` (3,), metres, in a frame with z up.
 
-    It looks along ``yaw`` (radians from +x towards +y), ``pitch`` above the horizon, and is then
-    turned by ``roll`` about its axis (clockwise as seen by the camera).
+    Its axis points along ``yaw`` (radians from +x towards +y) and ``pitch`` above the horizon;
+    ``roll`` rotates the camera about this axis (clockwise as seen by the camera).
     """
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
@@ -187,9 +187,9 @@ def looking_at(
 
 
 def cam_from_rig(right_deg: float, up_deg: float, position: Triple) -> RigidTransform:
-    """Pose of a camera on a rig whose frame has x to the right, y down and z ahead, metres.
+    """Return the pose of a camera on a rig with axes x right, y down and z forward, metres.
 
-    It looks ``right_deg`` to the right of ahead and ``up_deg`` up, from ``position``.
+    The camera points ``right_deg`` to the right and ``up_deg`` upwards, from ``position``.
     """
     right, up = np.radians(right_deg), np.radians(up_deg)
     about_y = np.array(
@@ -214,16 +214,16 @@ class Frame:
 
     name: str  # path below ``records_data``
     role: Role
-    condition: str  # what it is reported under: day, night, or a name of the dataset's own
-    place: int  # index of the place it shows
-    timestamp: int  # frames of one stop of a rig share it
+    condition: str  # day, night or a condition of the dataset, for reports
+    place: int  # index of the visible place
+    timestamp: int  # equal for the frames of one stop of a rig
     sensor_id: str
     camera: Camera
     cam_from_world: RigidTransform  # metres
     lighting: Lighting
     noise_seed: int  # of the sensor's noise
     moving_objects: tuple[MovingObject, ...] = ()  # in the place's frame
-    bonnet: bool = False  # the car's, in view
+    bonnet: bool = False  # the car's bonnet is visible
 
 
 def noise_seed(seed: int, image: str) -> int:
@@ -232,7 +232,7 @@ def noise_seed(seed: int, image: str) -> int:
 
 
 def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> list[Frame]:
-    """Convert the frames' poses to a dataset's published frame."""
+    """Convert the frames' poses to the coordinates of the published dataset."""
     world_from_official = official_from_world.inverse()
     return [
         replace(frame, cam_from_world=frame.cam_from_world @ world_from_official)
@@ -243,7 +243,7 @@ def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> li
 def kapture_records(
     frames: Iterable[Frame], *, poses: bool = True, named: bool = True
 ) -> KaptureData:
-    """Return sensors named by id, records and poses of the frames."""
+    """Return sensors, records and poses of the frames; ``named`` gives sensors their id as name."""
     data = KaptureData()
     for frame in frames:
         record = frame.timestamp, frame.sensor_id

@@ -1,8 +1,8 @@
-"""Floors of an office building: rooms of two kinds along a corridor; rooms of a kind are alike.
+"""Floors of an office building: two kinds of similar rooms along a corridor.
 
 A room has its door in the wall y = 0 and windows opposite. Rooms of a kind differ only in posters,
 a rug, a cupboard and the door sign; everything else, including dirt, is equal on all floors. Each
-floor has a separate coordinate frame; coordinates of different floors cannot be compared.
+floor has a separate coordinate frame.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from megloc_twins.textures import TextureRecipe, index_of, texels
 
 Point = tuple[float, float]
 
-ROOM_M = (6.0, 5.0)  # along the corridor, away from it
-MODULE_M = 7.0  # of corridor, with one room on each side
+ROOM_M = (6.0, 5.0)  # along the corridor and perpendicular to it
+MODULE_M = 7.0  # length of a corridor section, which has a room on each side
 CORRIDOR_M = 2.4
 WALL_THICKNESS_M = 0.15
 
 _HEIGHT_M = 2.8
 _DOOR_M = (1.0, 2.1)  # width, height
-_DOOR_X = 0.7  # of a room's door
+_DOOR_X = 0.7  # left edge of a room's door
 _POSTER_M = (0.9, 1.26)
 _TEXELS_PER_M = 100
-_GLASS = "window"  # a laser gets nothing back from what this painter paints
-_DIRT = 0.8  # of walls, floors and ceilings; rooms of a kind have it in common
-_INDIRECT = 0.12  # of the lamps' glow, what a ceiling receives from below
+_GLASS = "window"  # painter of textures that return no laser beam
+_DIRT = 0.8  # of walls, floors and ceilings; equal in rooms of a kind
+_INDIRECT = 0.12  # glow of the ceiling by indirect light, relative to that of lamps
 _SIZES = {  # width, height in texels
     "window": (156, 192),
     "door": (132, 270),
@@ -47,7 +47,7 @@ _SIZES = {  # width, height in texels
     "glow": (8, 8),
 }
 
-_SCAN_SHIFT_M = 0.35  # how far from the middle of a zone its scanner stands, at most
+_SCAN_SHIFT_M = 0.35  # largest distance of a scanner from the middle of its zone
 _SCAN_HEIGHT_M = 1.5
 _SCAN_TILT = 0.01  # radians; a tripod stands nearly upright
 
@@ -76,18 +76,18 @@ class Recipes:
 
 @dataclass
 class Parts:
-    """A room or a piece of corridor under construction, in its local frame (metres, z up)."""
+    """A room or corridor section under construction, in its local frame (metres, z up)."""
 
     recipes: Recipes
-    low: Point  # its corners on the ground
+    low: Point  # opposite corners on the ground
     high: Point
-    shared: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # what all of its kind have
-    own: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # what only this one has
+    shared: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # equal in all of its kind
+    own: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # individual
     lamps: list[Vector] = field(default_factory=list)
     obstacles: list[Obstacle] = field(default_factory=list)
 
     def surfaces(self) -> tuple[Surfaces, NDArray[np.bool_]]:
-        """Return all surfaces, and a mask of those that no other room has."""
+        """Return all surfaces, and a mask of the individual ones."""
         shared, own = self.shared.build(), self.own.build()
         return shared.joined(own), np.arange(len(shared) + len(own)) >= len(shared)
 
@@ -119,15 +119,15 @@ class Parts:
         size: tuple[float, float] = _POSTER_M,
         painter: str = "poster",
     ) -> None:
-        """Add a flat thing to a wall; ``at`` is its lower left corner, along the wall and above
-        ground."""
+        """Add a flat object to a wall; ``at`` is its lower left corner, along the wall and above
+        the floor."""
         span, height = (at[0], at[0] + size[0]), (at[1], at[1] + size[1])
         texture = self.recipes.thing(painter, *label)
         builder = self.own if own else self.shared
         on.block(builder, span, height, 0.03, front=texture, other=on.trim)
 
     def rug(self, at: Point, size: tuple[float, float], *label: str | int) -> None:
-        """Add an individual thing on the ground; ``at`` is its centre."""
+        """Add an individual rug on the floor; ``at`` is its centre."""
         corner = np.array([at[0] - 0.5 * size[0], at[1] + 0.5 * size[1], 0.01])
         along, across = np.array([size[0], 0.0, 0.0]), np.array([0.0, size[1], 0.0])
         self.own.add(corner, along, -across, self.recipes.thing("poster", *label))
@@ -154,14 +154,18 @@ class Parts:
 
 
 def _wall(start: Point, end: Point, texture: int, trim: int) -> Wall:
-    """Return the wall from ``start`` to ``end``, from left to right for a viewer in front."""
+    """Return the wall from ``start`` (left, seen from the front) to ``end``."""
     return Wall.between(np.array(start), np.array(end), texture, trim, _HEIGHT_M)
 
 
 @dataclass(frozen=True)
 class _RoomKind:
-    """Of the walls opposite the door, to its right, of the door and to its left: materials, and
-    where a room's own posters hang. Windows: their left ends, width, height above the floor."""
+    """Walls and windows of a kind of room.
+
+    ``materials`` and ``posters`` (positions of individual posters) are for the walls opposite the
+    door, to its right, of the door and to its left. ``windows``: left edges, width, lower and upper
+    edge above the floor.
+    """
 
     materials: tuple[str, str, str, str]
     windows: tuple[tuple[float, ...], float, float, float]
@@ -189,12 +193,12 @@ _KINDS = {
     ),
 }
 ROOM_KINDS = tuple(_KINDS)
-_ORDER = (0, 3, 1, 2)  # of the walls whose posters are counted
+_ORDER = (0, 3, 1, 2)  # of the walls, for numbering their posters
 
 
 def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
-    """Build a room of a kind in its frame, x and y from 0 to ROOM_M; ``owner`` names its individual
-    things."""
+    """Build a room of a kind in its frame, x and y from 0 to ROOM_M; ``owner`` is the label of its
+    individual objects."""
     parts, built = Parts(recipes, (0.0, 0.0), ROOM_M), _KINDS[kind]
     width, depth = ROOM_M
     parts.floor_and_ceiling(kind)
@@ -248,9 +252,10 @@ def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
 
 
 def build_module(recipes: Recipes, owner: str) -> Parts:
-    """Build a piece of corridor: x from 0 to MODULE_M, y from -CORRIDOR_M / 2 on.
+    """Build a corridor section: x from 0 to MODULE_M, y from -CORRIDOR_M / 2 to CORRIDOR_M / 2.
 
-    Its sides are equal up to a rotation by 180 degrees. Each has a room's door and a closed one.
+    A rotation by 180 degrees exchanges its sides. Each side has the door of a room and a closed
+    door.
     """
     half = CORRIDOR_M / 2
     parts = Parts(recipes, (0.0, -half), (MODULE_M, half))
@@ -276,7 +281,7 @@ def build_module(recipes: Recipes, owner: str) -> Parts:
         for x in (2.35, 5.3):
             label = (owner, number, str(x))
             parts.poster(side, (x, 1.6), *label, size=(0.5, 0.17), painter="sign")
-    # a sign that hangs across the corridor, to be seen from its ends
+    # a sign that hangs across the corridor, visible from its ends
     a, b = recipes.thing("sign", owner, "hanging", 0), recipes.thing("sign", owner, "hanging", 1)
     spot, size_m = (0.25 * MODULE_M, 0.0), (0.06, 0.9, 0.3)
     parts.own.add_box(spot, size_m, 0.0, (trim, a, trim, b), trim, base=2.3, bottom=trim)
@@ -297,33 +302,33 @@ def _build_end(recipes: Recipes, owner: str) -> Parts:
 
 @dataclass(frozen=True, eq=False)
 class Zone:
-    """A room or a piece of corridor of a floor."""
+    """A room or corridor section of a floor."""
 
     name: str  # unique on its floor
-    kind: str  # a room's kind, or ``corridor``
-    plan: FloorPlan  # where one can stand, in the place's frame
-    place_from_zone: RigidTransform  # those of a kind are alike in their own frames
-    scan_from_place: RigidTransform  # of the scanner in its middle
+    kind: str  # kind of the room, or ``corridor``
+    plan: FloorPlan  # free ground, in the place's frame
+    place_from_zone: RigidTransform  # zones of a kind are alike in their own frames
+    scan_from_place: RigidTransform  # of the scanner in the zone's middle
 
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """A floor, drawn as a place whose world is the floor's official frame."""
+    """A floor, rendered as a place whose world frame is the floor's official frame."""
 
     place: Place
-    zones: tuple[Zone, ...]  # rooms first, then pieces of corridor
-    own: NDArray[np.bool_]  # (N,), the surfaces that no other room or piece of corridor has
-    glass: NDArray[np.bool_]  # (N,), the surfaces that give a laser nothing back
+    zones: tuple[Zone, ...]  # rooms first, then corridor sections
+    own: NDArray[np.bool_]  # (N,), surfaces of individual objects of a zone
+    glass: NDArray[np.bool_]  # (N,), surfaces that return no laser beam
 
 
 def floor_place(modules: int, options: SyntheticWorldOptions, index: int) -> Place:
-    """Return a floor of a number of modules for :func:`render.render_frames`."""
+    """Return a floor with a number of corridor sections for :func:`render.render_frames`."""
     return build_floor(options.seed, index, modules).place
 
 
 @lru_cache(maxsize=4)
 def build_floor(seed: int, index: int, modules: int) -> Floor:
-    """Return floor ``index`` of a building, always the same object."""
+    """Return floor ``index`` of a building; results are cached."""
     recipes = Recipes(seed, list(moving_object_recipes(seed)))
     placed: list[tuple[Parts, RigidTransform]] = []
     rooms: list[Zone] = []
@@ -362,7 +367,7 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
 
 
 def _beside_corridor(turned: bool) -> RigidTransform:
-    """Return module_from_room: left of the walking direction x, or rotated and on the right."""
+    """Return ``module_from_room``: to the left of the x direction, or rotated and on the right."""
     x, y = 0.5 * (MODULE_M - ROOM_M[0]), 0.5 * CORRIDOR_M + WALL_THICKNESS_M
     return _placed(MODULE_M - x, -y, turned=True) if turned else _placed(x, y, turned=False)
 
@@ -373,7 +378,7 @@ def _placed(x: float, y: float, *, turned: bool) -> RigidTransform:
 
 
 def _official_frame(seed: int, index: int) -> RigidTransform:
-    """Return world_from_place, which differs by floor; their coordinates overlap."""
+    """Return ``world_from_place`` of a floor; coordinates of different floors overlap."""
     rng = stream(seed, "indoor", "frame", index)
     translation = np.array([*rng.uniform(-6, 6, 2), rng.uniform(-0.5, 0.5)])
     return settled_pose(about_z(rng.uniform(-np.pi, np.pi)), translation)

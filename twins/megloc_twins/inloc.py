@@ -1,4 +1,4 @@
-"""A rendered twin of InLoc: scans of two similar floors, and phone images."""
+"""A rendered twin of InLoc: laser scans of two similar floors, and phone images."""
 
 from __future__ import annotations
 
@@ -41,53 +41,53 @@ PITCHES_DEG = (-30, 0, 30)
 
 _RANGE_M = 18.0
 _RANGE_NOISE_M = 0.001
-_MIN_COSINE = 0.06  # a beam that grazes a surface does not come back
-_DARK = 24.0  # mean of the channels, 0..255; less swallows the beam
-_DROPOUTS = 0.02  # share of pixels without a return, for no reason
+_MIN_COSINE = 0.06  # beams at a more grazing angle do not return
+_DARK = 24.0  # mean of the channels, 0..255; darker pixels absorb the beam
+_DROPOUTS = 0.02  # share of pixels without a return, at random
 
 _FLOORS = ("DUC1", "DUC2")
 _BUILDING = "DUC"
-_FIRST_QUERY = 801  # of the numbers the telephone gave its images
+_FIRST_QUERY = 801  # number of the first phone image
 
-_REDUCTION = 20  # of a glance, px per px
+_REDUCTION = 20  # of the resolution, to test a query pose
 _ATTEMPTS = 400
 _WALL_DISTANCE_M = 0.7
 _NEAREST_M, _MEDIAN_M = 0.7, 1.6  # depth in a query's view: 10th percentile, median
-# share of a query's view that the scans of its floor have seen from about there; how much more
-# that must be than what scans of other rooms of the kind have seen of theirs, which is alike
+# smallest share of a query's view that scans of its floor saw from a similar viewpoint, and its
+# smallest difference from the share seen by scans of other rooms of the same kind
 _MIN_SEEN, _MIN_MARGIN = 0.6, 0.2
-# 90 degrees wide, 106 high
+# field of view 90 degrees wide, 106 high
 _QUARTER = Camera("SIMPLE_PINHOLE", 240, 320, (120.0, 120.0, 160.0))
 _MAX_ANGLE_DEG, _MAX_DISTANCE_RATIO = 35.0, 2.0
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-# where a scanner stands, and views all around, as high and low as its cutouts reach
+# centre of a scanner, and its views in all directions, up to the height of its cutouts
 ScanViews = tuple[Floats, list[CoarseView]]
 
 
 class InLocTwinOptions(TwinOptions):
-    """Contents of InLoc's twin; the defaults are what ``make eval`` localizes in."""
+    """Contents of InLoc's twin; ``make eval`` uses the defaults."""
 
     modules: int = Field(
-        default=2, ge=1, le=20, description="pieces of corridor per floor, two rooms on each"
+        default=2, ge=1, le=20, description="corridor sections per floor, each with two rooms"
     )
     queries: int = Field(default=48, ge=2, description="query images, both floors")
-    cutout_width: int = Field(default=400, ge=40, description="in px")
-    cutout_height: int = Field(default=300, ge=30, description="in px")
-    query_width: int = Field(default=640, ge=64, description="of those not held upright, in px")
-    query_height: int = Field(default=480, ge=48, description="in px")
+    cutout_width: int = Field(default=400, ge=40, description="width of cutouts in px")
+    cutout_height: int = Field(default=300, ge=30, description="height of cutouts in px")
+    query_width: int = Field(default=640, ge=64, description="width of landscape queries in px")
+    query_height: int = Field(default=480, ge=48, description="height of landscape queries in px")
     supersampling: int = Field(
-        default=2, ge=1, le=4, description="samples of queries per px and axis; of cutouts one"
+        default=2, ge=1, le=4, description="samples per pixel and axis of queries; cutouts have one"
     )
 
     def floors(self) -> list[Floor]:
-        """Return the building."""
+        """Return the floors of the building."""
         return [build_floor(self.seed, index, self.modules) for index in range(len(_FLOORS))]
 
 
 class InLocTwin(SyntheticDataset[InLocTwinOptions]):
-    """InLoc as it is published, with its truth.
+    """InLoc in its published layout, with true poses.
 
     ``database/`` (cutouts with their points, transformations), ``query/`` and ``ground_truth/``.
     """
@@ -151,7 +151,7 @@ def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
     for yaw in YAWS_DEG:
         for pitch in PITCHES_DEG:
             name = scan.image(yaw, pitch)
-            # one exposure for the whole panorama
+            # a panorama has a single exposure
             rng = stream(options.seed, "inloc", "light", scan.transformation)
             frames.append(
                 Frame(
@@ -171,7 +171,7 @@ def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
 
 
 def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform:
-    """Return a scan's pose before refinement: near the true one, slightly rotated."""
+    """Return a scan's pose before refinement: slightly displaced and rotated."""
     half = 0.5 * float(rng.normal(0, 0.02))
     w, z = settled((np.cos(half), np.sin(half))).tolist()
     turn = RigidTransform((w, 0.0, 0.0, z), (0.0, 0.0, 0.0))
@@ -191,7 +191,7 @@ def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: Rend
     points = scanned_points(floor, frame.camera, *poses, view.image, rng)
     content = BytesIO()
     savemat(content, {COLOURS: view.image, POINTS: points}, do_compression=True)
-    header = b"MATLAB 5.0 MAT-file".ljust(116)  # without SciPy's date
+    header = b"MATLAB 5.0 MAT-file".ljust(116)  # SciPy's header contains the date
     write_bytes(root / f"{frame.name}.mat", header + content.getvalue()[len(header) :])
 
 
@@ -206,9 +206,9 @@ def scanned_points(
     """Return the scanned point of each pixel of a cutout, float64 (H, W, 3), metres in the scan's
     frame.
 
-    NaN without a return: glass, dark pixels of ``image``, uint8 (H, W, 3), far away, at grazing
-    angles and at random. The noise is a millimetre along the beam; values are rounded to float32,
-    as in the official files.
+    Pixels without a return are NaN: on glass, where ``image``, uint8 (H, W, 3), is dark, far away,
+    at grazing angles and at random. The noise is a millimetre along the beam. Values are rounded to
+    float32, as in the official files.
     """
     grid = sample_grid(camera, 1)
     seen = visible_surfaces(floor.place.surfaces, cam_from_place, grid)
@@ -229,12 +229,12 @@ def scanned_points(
 
 
 def cam_from_scan(yaw_deg: float, pitch_deg: float) -> RigidTransform:
-    """Return a cutout's pose in its scan (z up): at yaw 0 it looks along -x, then turns right."""
+    """Return a cutout's pose in its scan (z up): -x is forward at yaw 0, positive yaw is right."""
     return looking_at(np.zeros(3), np.pi - np.radians(yaw_deg), np.radians(pitch_deg), 0.0)
 
 
 def cutout_camera(width: int, height: int) -> Camera:
-    """Return a cutout's camera, 60 degrees wide."""
+    """Return a cutout's camera, with a horizontal field of view of 60 degrees."""
     return Camera.pinhole(width, height, float(width / 2 / np.tan(np.radians(30.0))))
 
 
@@ -244,10 +244,11 @@ def phone_camera(width: int, height: int) -> Camera:
 
 
 def build_queries(options: InLocTwinOptions) -> list[Frame]:
-    """Choose phone images, floor by floor and zone by zone; about every third is held upright.
+    """Choose phone images, floor by floor and zone by zone; a third of them in portrait format.
 
-    Of some hundred random poses in the zone, take the first that the floor's scans cover well, and
-    better than scans of other rooms cover similar surfaces; else the closest to that.
+    A query gets the first of some hundred random poses whose view is covered well by the floor's
+    scans, and better than the corresponding view is by scans of similar rooms; else the pose that
+    comes closest.
     """
     floors = options.floors()
     scans = [[_scan_views(floor, zone) for zone in floor.zones] for floor in floors]
@@ -290,8 +291,8 @@ def _query_poses(
     scans: Sequence[Sequence[ScanViews]],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, tuple[RigidTransform, float]]]:
-    """Yield random poses in a zone of floor ``index`` with their yaws, each after its misfit; most
-    poses with a larger misfit than an earlier one are skipped."""
+    """Yield misfit, pose and yaw of random poses in a zone of floor ``index``; most poses with a
+    larger misfit than an earlier pose are skipped."""
     floor, plan = floors[index], zone.plan
     copies = list(_copies(floors, index, zone))
     least = np.inf
@@ -324,8 +325,8 @@ def _query_poses(
 def _copies(
     floors: Sequence[Floor], index: int, zone: Zone
 ) -> Iterator[tuple[int, RigidTransform]]:
-    """Yield floors and transforms from the zone to others of its kind; a corridor's also
-    rotated."""
+    """Yield floor and transform from the zone to each other zone of its kind; for corridors also
+    rotated by 180 degrees."""
     half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (MODULE_M, 0.0, 0.0))
     for other_index, floor in enumerate(floors):
         for other in floor.zones:
@@ -345,7 +346,7 @@ def _scan_views(floor: Floor, zone: Zone) -> ScanViews:
 
 
 def _have_seen(scans: Sequence[ScanViews], points: Floats, position: Floats) -> Bools:
-    """Select points (P, 3) that a scan has seen similarly to a view from ``position`` (3,)."""
+    """Select points (P, 3) that a scan saw from a viewpoint similar to ``position`` (3,)."""
     found = np.zeros(len(points), bool)
     here = points - position
     distance = np.linalg.norm(here, axis=1)
@@ -364,7 +365,7 @@ def _have_seen(scans: Sequence[ScanViews], points: Floats, position: Floats) -> 
 def _people(
     zone: Zone, pose: RigidTransform, yaw: float, rng: np.random.Generator
 ) -> tuple[MovingObject, ...]:
-    """Place up to two people in front of every second phone."""
+    """Place up to two people in front of the phone, in half of the images."""
     people: list[MovingObject] = []
     wanted = int(rng.integers(0, 4)) - 1
     x0, y0, _ = pose.center()

@@ -1,5 +1,5 @@
-"""Writers of the official layouts' files: COLMAP and NVM models, lists of images with cameras,
-InLoc's transformations. Numbers are the shortest texts that are read back exactly."""
+"""Writers of the official layouts' files: COLMAP and NVM models, camera lists and InLoc's
+transformations. Numbers are written with the fewest digits that preserve their value."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from megloc_kapture.io.files import check_relative, write_bytes
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 from megloc_twins.options import write_lines
 
-# a feature of an image in the binary file
+# record of a feature in images.bin
 BINARY_FEATURE = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
 _NO_POINT = -1
 _UNKNOWN_ERROR_PX = -1.0
@@ -32,7 +32,7 @@ _UNKNOWN_ERROR_PX = -1.0
 def write_colmap_text(folder: Path, model: ColmapModel) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt``; points get the ids 1, 2, ...
 
-    Raises OutputError where they cannot be written.
+    Raises OutputError if a file cannot be written.
     """
     cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
     for camera_id, camera in sorted(model.cameras.items()):
@@ -56,7 +56,7 @@ def write_colmap_text(folder: Path, model: ColmapModel) -> None:
 def write_colmap_binary(folder: Path, model: ColmapModel) -> None:
     """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin``; points get the ids 1, 2, ...
 
-    Raises OutputError where they cannot be written.
+    Raises OutputError if a file cannot be written.
     """
     cameras = [struct.pack("<Q", len(model.cameras))]
     for camera_id, camera in sorted(model.cameras.items()):
@@ -87,7 +87,7 @@ def _features(
 ) -> Iterator[tuple[ColmapImage, NDArray[np.float32], NDArray[np.int64]]]:
     """Yield each image with its features: positions (M, 2), and point ids or -1.
 
-    Features without a point are at (0, 0): their rows keep the indices of the others.
+    Features without a point are at (0, 0); their rows are needed for the indices of the others.
     """
     points = model.points
     for position, image in enumerate(model.images):
@@ -116,9 +116,9 @@ def _tracks(points: SparsePoints) -> Iterator[tuple[list[float], list[int], slic
 
 
 def write_nvm(path: Path, model: NvmModel) -> None:
-    """Write one model as COLMAP's exporter does: k with NVM's sign, pixels as they are.
+    """Write one model as COLMAP's exporter does: k with NVM's sign, pixels unchanged.
 
-    Raises OutputError where it cannot be written.
+    Raises OutputError if the file cannot be written.
     """
     points = model.points
     cameras = np.column_stack(
@@ -139,15 +139,15 @@ def write_nvm(path: Path, model: NvmModel) -> None:
 def write_query_list(
     path: Path, cameras: Mapping[str, Camera], *, last_line_ends: bool = True
 ) -> None:
-    """Write a list in the order of ``cameras``; numbers as short as they read back the same.
+    """Write a camera list in the order of ``cameras``.
 
     Parameters
     ----------
-    last_line_ends : False leaves the last line without its end, as in published lists.
+    last_line_ends : False omits the last line break, as in published lists.
 
     Raises
     ------
-    DataError : a name with white space in it, or that is no plain relative path.
+    DataError : a name contains white space or is not a plain relative path.
     OutputError : the file cannot be written.
     """
     lines = []
@@ -160,8 +160,7 @@ def write_query_list(
 
 
 def _shortest(value: float) -> str:
-    """Format as the shortest text that is read back as the same float64; whole numbers without a
-    point."""
+    """Format with the fewest digits that preserve the float64; whole numbers without a point."""
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 

@@ -1,4 +1,4 @@
-"""Floor plans, and the people and cars on them, which differ from image to image."""
+"""Floor plans, with people and cars that differ from image to image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from megloc_twins.textures import TextureRecipe
 Floats = NDArray[np.float64]
 Kind = Literal["person", "car"]
 
-# outlines (counter-clockwise) and the closed path of the mapping rig, metres
+# outline (counter-clockwise) and closed path of the mapping rig, metres
 _SHAPES: tuple[tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float], ...]], ...] = (
     (  # a courtyard
         ((-8.5, -6.5), (8.5, -6.5), (8.5, 6.5), (-8.5, 6.5)),
@@ -37,7 +37,7 @@ _SHAPES: tuple[tuple[tuple[tuple[float, float], ...], tuple[tuple[float, float],
 
 NUM_PEOPLE = 6
 NUM_CARS = 3
-_HEAD = 0.13  # part of a person's texture that is the head
+_HEAD = 0.13  # height of the head in a person's texture, as a fraction
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Obstacle:
 class FloorPlan:
     """Plan of a place in its frame, metres.
 
-    ``outline``, float64 (N, 2), is the base line of its walls, counter-clockwise; ``path``, float64
+    ``outline``, float64 (N, 2), is the counter-clockwise base line of the walls; ``path``, float64
     (M, 2), is the closed path of the mapping rig.
     """
 
@@ -62,7 +62,7 @@ class FloorPlan:
     obstacles: tuple[Obstacle, ...] = ()
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
-        """Return whether a circle of radius ``margin`` around (x, y) meets no wall or obstacle."""
+        """Return True if a circle of radius ``margin`` around (x, y) meets no wall or obstacle."""
         return (
             self._is_inside(x, y)
             and _distance_to_ring(x, y, self.outline) >= margin
@@ -104,7 +104,7 @@ class FloorPlan:
 
 
 def draw_floor_plan(rng: np.random.Generator, index: int) -> FloorPlan:
-    """Return the empty floor plan of place ``index``: one of four shapes, a little stretched."""
+    """Return the empty floor plan of place ``index``: one of four shapes, slightly stretched."""
     outline, path = (np.array(shape) for shape in _SHAPES[index % len(_SHAPES)])
     stretch = rng.uniform(0.94, 1.06, 2)
     return FloorPlan(outline * stretch, path * stretch)
@@ -120,7 +120,7 @@ def _distance_to_ring(x: float, y: float, ring: Floats) -> float:
 class MovingObject:
     """A person or car at one moment: x, y (metres) and yaw (radians) in the place's frame.
 
-    ``variant`` counts those of a kind from 0.
+    ``variant`` numbers the textures of a kind from 0.
     """
 
     kind: Kind
@@ -135,8 +135,8 @@ class MovingObject:
 
 
 def moving_object_recipes(seed: int) -> list[TextureRecipe]:
-    """Return the textures of all moving objects; they come first in every place, so indices
-    agree."""
+    """Return the textures of all moving objects; they are first in every place, so their indices
+    are equal."""
     number = seed_of(seed, "movers")
     recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
     for i in range(NUM_CARS):
@@ -155,7 +155,7 @@ def place_moving_objects(
 ) -> tuple[MovingObject, ...]:
     """Place up to ``count`` people and cars near a position (x, y first; metres, place's frame).
 
-    They are in front of it if ``yaw`` (radians) is given, else all around.
+    With ``yaw`` (radians) they are in front of the position, else all around it.
     """
     moving_objects: list[MovingObject] = []
     for _ in range(60):
@@ -178,7 +178,7 @@ def place_moving_objects(
 
 
 def moving_object_surfaces(moving_objects: tuple[MovingObject, ...]) -> Surfaces:
-    """Return their surfaces in the place's frame; textures as in :func:`moving_object_recipes`."""
+    """Return the surfaces in the place's frame; textures index :func:`moving_object_recipes`."""
     builder = SurfaceBuilder()
     for item in moving_objects:
         at, yaw = item.position, item.yaw

@@ -36,8 +36,8 @@ class TwinOptions(Options):
 class SyntheticWorldOptions(TwinOptions):
     """Contents and images of the synthetic world.
 
-    The defaults are hard enough that retrieval is often wrong and night is worse than day, and easy
-    enough that day queries are localized.
+    With the defaults, retrieval is often wrong and recall is lower at night than by day, but day
+    queries are localized.
     """
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
@@ -52,10 +52,10 @@ class SyntheticWorldOptions(TwinOptions):
         default=0.6,
         ge=0,
         le=1,
-        description="share of posters, doors and windows that all places have in common",
+        description="share of posters, doors and windows that are equal in all places",
     )
     moving_objects: int = Field(
-        default=2, ge=0, description="people and cars around each stop of the rig or query"
+        default=2, ge=0, description="people and cars around each rig stop and query"
     )
     night_exposure: float = Field(
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
@@ -65,27 +65,28 @@ class SyntheticWorldOptions(TwinOptions):
 
 
 def stream(seed: int, *labels: str | int) -> np.random.Generator:
-    """Return the random stream of a thing in the world, named by ``labels``.
+    """Return the random generator of an object or choice with these ``labels``.
 
-    Streams are independent, so adding a query or a poster does not change the rest of the world.
+    Generators are independent, so an additional query or poster does not change the rest of the
+    world.
     """
     return np.random.default_rng([seed, crc32("/".join(map(str, labels)).encode())])
 
 
 def seed_of(seed: int, *labels: str | int) -> int:
-    """Return a seed of a thing in the world; see :func:`stream`."""
+    """Return a seed by labels; see :func:`stream`."""
     return int(stream(seed, *labels).integers(2**31))
 
 
 class SyntheticDataset(ABC, Generic[OptionsT]):
     """A dataset rendered from its options; group ``megloc_kapture.rendered_datasets``.
 
-    ``options`` are of the class's model ``Options``, by default its defaults.
+    ``options`` have the class's type ``Options``; None means the defaults.
     """
 
     Options: ClassVar[type[Options]]
     version: ClassVar[int]
-    """Increase it when equal options give other files than before."""
+    """Version of the files; increase it when equal options give different files."""
     options: OptionsT
 
     def __init__(self, options: OptionsT | None = None) -> None:
@@ -95,7 +96,7 @@ class SyntheticDataset(ABC, Generic[OptionsT]):
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         """Render the dataset, write it below ``root`` and return counts.
 
-        The bytes depend on the options alone. The processes of ``work`` must see the same files.
+        The bytes depend on the options only. All processes of ``work`` must share a file system.
 
         Raises OutputError if a file cannot be written.
         """
@@ -105,14 +106,14 @@ class ModelTwinOptions(TwinOptions):
     """Options of a twin with a sparse model."""
 
     points_per_image: int = Field(
-        default=100, ge=1, description="points of the sparse models, drawn in each image"
+        default=100, ge=1, description="random points per image for the sparse models"
     )
     night_exposure: float = Field(
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
     )
     model_features: bool = Field(
         default=False,
-        description="make sparse models of SIFT features, with their database, instead of exact "
+        description="build sparse models from SIFT features, with a database, instead of exact "
         "points",
     )
 

@@ -1,9 +1,9 @@
 """Arithmetic with the same bits on every processor.
 
-Sums, products, quotients and square roots are exact to the last bit (IEEE 754). BLAS products,
-OpenCV filters and elementary functions are not: they depend on the processor's instructions, such
-as fused ones. So products and filters are explicit sums here; elementary functions are computed in
-float64 and rounded.
+Sums, products, quotients and square roots are correctly rounded (IEEE 754), so they are equal
+everywhere. BLAS products, OpenCV filters and elementary functions depend on the processor's
+instructions, such as fused multiply-add. So matrix products and filters are explicit sums here, and
+elementary functions are computed in float64 and rounded.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from numpy.typing import ArrayLike, NDArray
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.values import RigidTransform
 
-_DECIMALS = 9  # a nanometre; errors of the functions that were used are a millionth of it
-_CUBIC = -0.75  # the slope at distance 1, as OpenCV has it
+_DECIMALS = 9  # a nanometre, a million times the errors of the elementary functions
+_CUBIC = -0.75  # slope of the kernel at distance 1, as in OpenCV
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 
 def settled(values: ArrayLike) -> Float64:
-    """Round metres, radians or components of a unit vector to drop their last bits, float64."""
+    """Round metres, radians or components of unit vectors to nine decimals, float64."""
     rounded = np.round(np.asarray(values, np.float64), _DECIMALS)
-    return np.asarray(rounded + 0.0, np.float64)  # of -0 and 0, 0
+    return np.asarray(rounded + 0.0, np.float64)  # adding 0 turns -0 into 0
 
 
 def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
-    """Return the transform of a rotation (3, 3) and a translation (3,), without the last bits."""
+    """Return the transform of a rotation (3, 3) and a translation (3,), rounded."""
     quat = settled(RigidTransform.from_matrix(rotation, translation).quat_wxyz)
-    # half a turn has w = 0, give or take a last bit, by which either sign may come out
+    # rounding errors of w decide the quaternion's sign for rotations by 180 degrees
     w, x, y, z = (quat * np.sign(quat[np.flatnonzero(quat)[0]]) + 0.0).tolist()
     length = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / length, x / length, y / length, z / length
@@ -67,7 +67,7 @@ def product(left: Float64, right: Float64) -> Float64:
 def resized(image: Float32, width: int, height: int, *, cubic: bool = False) -> Float32:
     """Enlarge an image (h, w, ...) to (height, width, ...), linearly or by Keys' cubic.
 
-    Pixel centres are half a pixel inside the edge; edge pixels are repeated beyond it.
+    Pixel centres are half a pixel inside the image; edge pixels are repeated outside it.
     """
     across = _interpolated(np.moveaxis(image, 1, 0), width, cubic)
     return _interpolated(np.moveaxis(across, 0, 1), height, cubic)

@@ -1,8 +1,8 @@
 """Exact rasterization of textured parallelograms: surface, depth and colour of each sample.
 
-A sample's ray is ``(x_n, y_n, 1)`` in the camera. On a surface's plane, inverse depth and the two
-texture coordinates over depth are linear in it, so each surface costs three planes and a few
-comparisons over its bounding box. Depth is z along the optical axis, metres.
+A sample's ray is ``(x_n, y_n, 1)`` in the camera frame. On a plane, inverse depth and the texture
+coordinates divided by depth are linear in the ray. So each surface needs three linear forms and a
+few comparisons within its bounding box. Depth is z along the optical axis, metres.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ NO_SURFACE = -1
 class SampleGrid:
     """The rays of a camera's samples, at the centres of ``supersampling``² cells per pixel.
 
-    ``x`` and ``y`` are normalised coordinates, float64, broadcasting to (H * supersampling,
-    W * supersampling); of cameras without distortion (1, columns) and (rows, 1).
+    ``x`` and ``y`` are normalised coordinates, float64, which broadcast to (H * supersampling,
+    W * supersampling); without distortion their shapes are (1, columns) and (rows, 1).
     """
 
     camera: Camera
@@ -50,8 +50,8 @@ class SampleGrid:
 class Visibility:
     """The nearest surface along each sample's ray.
 
-    ``planes``, (N, 3, 3), are per surface the linear forms, in the ray (x_n, y_n, 1), of 1/z and of
-    its two coordinates (0..1 inside the surface) over z.
+    ``planes``, (N, 3, 3), are three linear forms in the ray (x_n, y_n, 1) per surface: 1/z, and the
+    two surface coordinates (0..1 inside the surface) divided by z.
     """
 
     grid: SampleGrid
@@ -80,8 +80,8 @@ def sample_grid(camera: Camera, supersampling: int) -> SampleGrid:
     x, y = ((columns - cx) / fx)[None], ((rows - cy) / fy)[:, None]
     if k:
         squared = x * x + y * y
-        # radius shrinks by the same factor for all rays of a radius: solve r (1 + k r^2) = r_d
-        # on a fine table, then interpolate (error below 1e-9)
+        # undistortion depends on the radius only: solve r (1 + k r^2) = r_d on a fine table, then
+        # interpolate (error below 1e-9)
         table = np.linspace(0.0, float(squared.max()) * (1 + 1e-9), 8193)
         factor = np.ones_like(table)
         for _ in range(30):
@@ -93,7 +93,7 @@ def sample_grid(camera: Camera, supersampling: int) -> SampleGrid:
 
 
 def project(camera: Camera, points: Float64) -> Float64:
-    """Project points (N, 3) in the camera's frame, in front of it, to pixels (N, 2)."""
+    """Project points (N, 3), in the camera's frame and in front of it, to pixels (N, 2)."""
     fx, fy, cx, cy, k = intrinsics(camera)
     xy = points[:, :2] / points[:, 2:]
     xy = xy * (1 + k * (xy**2).sum(1, keepdims=True))
@@ -127,7 +127,7 @@ def _cover(
     nearest: Float32,
     surface: NDArray[np.int16],
 ) -> None:
-    """Write each candidate within its box if it is nearer than the current surface."""
+    """Draw each candidate within its box where it is nearer than the current surface, in place."""
     for index in candidates:
         left, right, top, bottom = boxes[index]
         depth, along_u, along_v = forms[index]
@@ -175,8 +175,8 @@ def _bounding_boxes(corners: Float64, grid: SampleGrid) -> NDArray[np.int64]:
     for axis, rays in enumerate((grid.x, grid.y)):
         along = points[..., axis] / depth
         low, high = (np.where(valid, along, end).T for end in (np.inf, -np.inf))
-        # a ray's coordinate grows along its row or column, whatever the distortion; a sample on
-        # the edge of the range may be lost to rounding: one more on each side
+        # ray coordinates increase along rows and columns for any distortion; one more sample on
+        # each side, since rounding may exclude samples at the ends of the range
         least, most = rays.min(axis), rays.max(axis)
         first = np.searchsorted(most, low.min(0)) - 1
         last = np.searchsorted(least, high.max(0), side="right") + 1
@@ -200,7 +200,7 @@ def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32
     """Return the colour of each sample, float32 (rows, columns, 3), RGB 0..255; 0 without a
     surface.
 
-    The texture level follows from the area of a sample in texels; two levels are blended.
+    The texture level is chosen by the area of a sample in texels; two levels are blended.
     """
     index = np.maximum(seen.surface, 0).astype(np.int32)
     hit = seen.surface != NO_SURFACE
@@ -245,7 +245,7 @@ def _level(
 
 
 def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
-    """(N * NUM_LEVELS, 4): atlas x = t0 + u t1, y = t2 + v t3, the first pixel's centre at 0."""
+    """Return t (N * NUM_LEVELS, 4): atlas pixel x = t0 + u t1, y = t2 + v t3; first centre at 0."""
     corner, size = atlas.corner[surfaces.texture], atlas.size[surfaces.texture]
     start, end = surfaces.uv[:, None, :2], surfaces.uv[:, None, 2:]
     base, step = corner + start * size - 0.5, (end - start) * size
@@ -257,8 +257,8 @@ def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
 def bilinear(image: NDArray[Any], x: Float32, y: Float32) -> Float32:
     """Interpolate an image (H, W, C) at ``x``, ``y``, float32 (R, S) each: float32 (R, S, C).
 
-    The first pixel's centre is (0, 0); edge values continue beyond the edge, NaN gives the first
-    pixel. OpenCV uses fused multiplications on some processors; this compiled loop does not.
+    The first pixel's centre is (0, 0). Edge pixels are repeated outside the image; NaN gives the
+    first pixel. OpenCV uses fused multiply-add on some processors; this loop does not.
     """
     height, width, channels = image.shape
     rows, columns = x.shape

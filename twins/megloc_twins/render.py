@@ -1,6 +1,7 @@
 """Rendering of frames to images, depth and masks, on any executor.
 
-The colours of surface samples become pixels: sun, shadows, sky, lamps, bonnet, lens and sensor.
+Surface samples are lit by sun, sky and lamps, with shadows; bonnet, lens and sensor turn them into
+pixels.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ Result = TypeVar("Result")
 PlaceBuilder = Callable[[SyntheticWorldOptions, int], Place]
 Mask = NDArray[np.bool_]
 
-_FRAMES_PER_BATCH = 13  # painting a place's textures costs about as much as four images
-_BONNET_COVERS = 0.5  # share of a pixel from which the mask and the depth leave it out
-_BONNET_TOUCHES = 1e-6  # share of a pixel
+_FRAMES_PER_BATCH = 13  # each batch paints the textures, which takes as long as four frames
+_BONNET_COVERS = 0.5  # covered share of a pixel above which mask and depth exclude it
+_BONNET_TOUCHES = 1e-6  # smallest covered share of a pixel that the bonnet touches
 
 _SHADOW_SIZE = 1024
-_BIAS_M = 0.05  # surfaces must not shade themselves
+_BIAS_M = 0.05  # prevents surfaces from shading themselves
 _NOTHING = np.float32(-1e9)
 _LAMP_RANGE_M = 14.0
 _CLOUD_SIZE = 512
@@ -55,11 +56,11 @@ class ShadowMap:
 
     axes: NDArray[np.float64]  # (3, 3), rows: the grid's x and y directions and the sun's
     low: NDArray[np.float64]  # (2,), the grid's corner
-    step: float  # metres between its lines
+    step: float  # grid spacing, metres
     height: Float32  # (_SHADOW_SIZE, _SHADOW_SIZE), metres along the sun's direction
 
     def lit(self, x: Float32, y: Float32, z: Float32) -> Float32:
-        """Return 1 for points in the sun, else 0; arrays of one shape, metres."""
+        """Return 1 for points in the sun, else 0; the coordinates have equal shapes, metres."""
         a = self.axes.astype(np.float32)
         gx, gy, up = (row[0] * x + row[1] * y + row[2] * z for row in a)
         gx = (gx - np.float32(self.low[0])) / np.float32(self.step) - np.float32(0.5)
@@ -70,7 +71,7 @@ class ShadowMap:
 
 
 def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
-    """Compute the shadow map of the surfaces (both sides cast shadows)."""
+    """Compute the shadow map of surfaces; front and back cast shadows."""
     sun = np.array(sun_direction)
     side = np.cross([0.0, 0.0, 1.0] if abs(sun[2]) < 0.99 else [1.0, 0.0, 0.0], sun)
     side /= np.sqrt((side * side).sum())
@@ -85,7 +86,7 @@ def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
 
 
 def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
-    """Add the shadows of more surfaces, as far as they are on the grid."""
+    """Add the shadows of more surfaces; parts outside the grid are ignored."""
     axes, low, step, height = shadows.axes, shadows.low, shadows.step, shadows.height.copy()
     outline = (product(surfaces.corners(), axes.T)[..., :2] - low) / step
     first = np.clip(np.floor(outline.min(1)) - 1, 0, _SHADOW_SIZE).astype(int)
@@ -130,11 +131,11 @@ def radiance(
     shadows: ShadowMap | None,
     clouds: Float32,
 ) -> Float32:
-    """Light that each sample receives, float32 (rows, columns, 3), linear.
+    """Return the linear light along each sample's ray, float32 (rows, columns, 3).
 
-    ``colour``, float32 (rows, columns, 3), is 0..255 with gamma 2, as a texture is painted;
-    surfaces and ``lamps``, float64 (L, 3), are in the place's frame, metres. Without ``shadows``
-    the sun lights all that faces it.
+    ``colour``, float32 (rows, columns, 3), is 0..255 with gamma 2, as textures are painted.
+    Surfaces and ``lamps``, float64 (L, 3), are in the place's frame, metres. Without ``shadows``
+    the sun lights every surface that faces it.
     """
     index = np.maximum(seen.surface, 0).astype(np.int32)
     albedo = (colour * np.float32(1 / 255)) ** 2
@@ -163,8 +164,8 @@ def radiance(
 
 
 def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
-    """Return x, y, z of each sample's surface point, place's frame, metres; the camera's if
-    none."""
+    """Return x, y, z of each sample's surface point in the place's frame, metres; those of the
+    camera without a surface."""
     rotation = cam_from_place.rotation_matrix().astype(np.float32)
     center = cam_from_place.center().astype(np.float32)
     hit = seen.inverse_depth > 0
@@ -213,7 +214,7 @@ def _sky(
 def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDArray[np.uint8]:
     """Expose an image, uint8 (H, W, 3) RGB, from the light of its samples (H * ss, W * ss, 3).
 
-    ``seed`` is the bonnet's, if the frame shows one.
+    ``seed`` determines the bonnet's dirt, if the frame shows a bonnet.
     """
     lighting, width, height = frame.lighting, frame.camera.width, frame.camera.height
     if supersampling > 1:
@@ -225,14 +226,14 @@ def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDAr
         light = light * (1 - cover[..., None]) + paint * cover[..., None] * lit
     signal = light * (_rgb(lighting.white_balance) * np.float32(lighting.exposure))
     signal *= (1 - np.float32(lighting.vignetting) * _corner_distance(width, height))[..., None]
-    if lighting.condition == "night":  # light that strays around lamps
+    if lighting.condition == "night":  # stray light around lamps
         haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
         signal = signal + np.float32(0.06) * haze
     signal = blurred(signal, lighting.blur_px)
     rng = np.random.default_rng(frame.noise_seed)
     deviation = np.sqrt(lighting.shot_noise * signal + lighting.read_noise**2)
     signal = signal + deviation * rng.standard_normal(signal.shape, dtype=np.float32)
-    # a shoulder instead of a hard limit, then gamma 2
+    # compress highlights smoothly instead of clipping them, then apply gamma 2
     signal = np.clip(signal, 0, None)
     signal = np.where(signal > 0.7, 1 - 0.3 * exp(-(signal - 0.7) / 0.3), signal)
     return np.clip(np.sqrt(signal) * 255 + 0.5, 0, 255).astype(np.uint8)
@@ -248,8 +249,10 @@ def _corner_distance(width: int, height: int) -> Float32:
 
 @lru_cache(maxsize=4)
 def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
-    """Paint the bonnet in the front camera: cover (H, W) 0..1 and paint (H, W, 3) linear, with
-    seams, dirt and emblem; it is the same in all images."""
+    """Paint the car's bonnet, with seams, dirt and emblem; it is the same in all images of a seed.
+
+    Return its coverage (H, W), 0..1, and its linear colour (H, W, 3).
+    """
     x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
     y = (np.arange(height, dtype=np.float32) + 0.5) / height
     edge = 0.86 + 0.11 * x**2
@@ -279,8 +282,8 @@ def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
 class RenderedFrame:
     """A rendered frame.
 
-    Depth is along the optical axis at the pixels' centres, including moving objects, 0 without a
-    surface or behind the bonnet. None unless requested.
+    ``depth_m`` is None unless requested: depth along the optical axis at pixel centres, including
+    moving objects, 0 without a surface or behind the bonnet.
     """
 
     image: NDArray[np.uint8]  # (H, W, 3), RGB
@@ -336,8 +339,8 @@ class PlaceRenderer:
         return RenderedFrame(image, depth_m, mask)
 
     def _static_shadows(self, sun: Triple) -> ShadowMap:
-        """Return the shadows of static surfaces; the last are cached, as frames often share a
-        sun."""
+        """Return the shadow map of the static surfaces; the last one is cached, because consecutive
+        frames often have the same sun."""
         if self._shadows is None or self._shadows[0] != sun:
             self._shadows = (sun, cast_shadows(self._place.surfaces, sun))
         return self._shadows[1]
@@ -353,15 +356,15 @@ def render_frames(
     sky_seed: int | None = None,
     work: Work = HERE,
 ) -> dict[str, Result]:
-    """Render every frame and hand it to ``finish`` in the same process; its results by image name.
+    """Render every frame and pass it to ``finish``; return the results by image name.
 
     Parameters
     ----------
-    finish : called as ``finish(frame, rendered)``, with an executor in another process: a
-        module-level function or a ``functools.partial`` of one, which writes the files.
+    finish : called as ``finish(frame, rendered)`` in the process that rendered the frame, to write
+        the files; must be picklable.
     with_depth : names of the frames that need ``depth_m``.
-    build : lays out a place of these options by its index, the same in every process.
-    sky_seed : of clouds and the dirt on the bonnet; the world's unless given.
+    build : returns the place with an index, the same in every process.
+    sky_seed : seed of the clouds and of the dirt on the bonnet; by default that of the world.
     """
     seed = options.seed if sky_seed is None else sky_seed
     render = partial(_render, options, build, seed, frozenset(with_depth), finish)
@@ -409,13 +412,13 @@ def _bonnet_cover(frame: Frame, seed: int) -> Float32:
 
 
 def on_bonnet(frame: Frame, seed: int) -> Mask:
-    """Return the pixels (H, W) that the bonnet covers at least partly, in the world of ``seed``."""
+    """Return a mask (H, W) of the pixels that the bonnet of a seed covers at least partly."""
     return _bonnet_cover(frame, seed) > _BONNET_TOUCHES
 
 
 def on_moving_objects(frame: Frame, place: Place) -> Mask:
-    """Return the pixels (H, W) whose centre shows a person or a car, ignoring the bonnet."""
-    # the moving objects' surfaces come behind the place's own
+    """Return a mask (H, W) of pixels whose centre shows a person or car; ignores the bonnet."""
+    # surfaces of moving objects follow those of the place
     surfaces = place.surfaces.joined(moving_object_surfaces(frame.moving_objects))
     seen = visible_surfaces(surfaces, place.cam_from_place(frame), sample_grid(frame.camera, 1))
     return seen.surface >= len(place.surfaces)

@@ -51,14 +51,14 @@ from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misf
 REFERENCE_CONDITION = "overcast-reference"
 CONDITIONS = ("dawn", "overcast-winter", "rain", "sun", "night", "night-rain")
 CAMERAS = ("left", "rear", "right")
-SCORED_CAMERA = "rear"  # it sees the car's boot too
+SCORED_CAMERA = "rear"  # also shows the car's boot
 
-# the published world is metric with z up; this one lies elsewhere than the rendered one
+# published coordinates are in metres with z up, and differ from those of the rendered world
 OFFICIAL_FROM_WORLD = settled_pose(
     np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     np.array([-412.25, 1381.5, 62.75]),
 )
-# microseconds, of the first image of each traversal
+# time of the first image of each traversal, microseconds
 _STARTS_US = {
     "overcast-reference": 1417176458999821,
     "dawn": 1418721355075498,
@@ -70,24 +70,24 @@ _STARTS_US = {
 }
 _PLACE_US, _STOP_US = 60_000_000, 1_062_501
 _CAMERA_HEIGHT_M = 1.6
-# where the cameras look, degrees to the right of the driver and up, and where they are on the
-# car, metres to the right, down and ahead of its origin
+# viewing directions of the cameras, degrees to the right of straight ahead and upwards, and their
+# positions, metres to the right, down and ahead of the car's origin
 CAM_FROM_CAR = {
     "left": cam_from_rig(-84.0, 3.0, (-0.35, 0.02, -0.1)),
     "rear": cam_from_rig(179.2, -4.0, (0.06, 0.15, -1.1)),
     "right": cam_from_rig(86.0, 2.0, (0.34, 0.03, -0.1)),
 }
 _CENTRES = {"left": (0.4884, 0.4995), "rear": (0.4963, 0.4865), "right": (0.4907, 0.4788)}
-_FOCAL = 0.6  # of the width
-_MIN_OVERLAP = 0.1  # of a map image that supports a query
+_FOCAL = 0.6  # focal length over the image width
+_MIN_OVERLAP = 0.1  # smallest overlap of a map image that supports a query
 _ATTEMPTS = 50
-_STEPS = 997  # of the path, that a query may be at
-# moments of these traversals, the last of each, are in neither list of version 2
+_STEPS = 997  # number of possible positions of a query along the path
+# the last moment of each of these traversals is in neither list of version 2
 _UNLISTED_CONDITIONS = ("rain", "night-rain")
 
 
 class RobotCarTwinOptions(ModelTwinOptions):
-    """Contents of RobotCar Seasons' twin; the defaults are what ``make eval`` localizes in."""
+    """Contents of RobotCar Seasons' twin; ``make eval`` uses the defaults."""
 
     num_locations: int = Field(default=3, ge=1, description="locations, at least 60 m apart")
     stops_per_location: int = Field(
@@ -104,13 +104,14 @@ class RobotCarTwinOptions(ModelTwinOptions):
 
 
 class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
-    """RobotCar Seasons as it is published, with its truth.
+    """RobotCar Seasons in its published layout, with true poses.
 
     ``images/``, ``intrinsics/``, ``extrinsics/``, ``3D-models/`` (the merged NVM, text models and
     lists of queries by location), version 2's lists and ``ground_truth/``. Quirks of the original:
-    the models say ``.png`` where the images are ``.jpg``, the NVM puts ``./`` before them, the
-    test list leaves out the conditions, some reference images are in no model and some queries
-    in neither list of version 2; and lists end in a blank line, with CRLF or without a line end.
+    names in the models end in ``.png`` although images are ``.jpg``, and in the NVM begin with
+    ``./``; the test list omits the conditions; some reference images are in no model and some
+    queries in neither list of version 2; lists end with a blank line, have CRLF line breaks or lack
+    the last line break.
     With ``model_features`` also ``3D-models/overcast-reference.db``, the features of the models.
     """
 
@@ -141,9 +142,9 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
 
 @dataclass(frozen=True, eq=False)
 class RobotCarFrames:
-    """All images of the twin, three per moment; poses in the world's frame.
+    """All images of the twin, three per moment, with poses in the world.
 
-    ``mapping`` are sorted by location, then time, ``queries`` by condition, then time.
+    ``mapping`` is sorted by location, then time, ``queries`` by condition, then time.
     """
 
     mapping: tuple[Frame, ...]
@@ -151,7 +152,7 @@ class RobotCarFrames:
 
 
 def build_robotcar_frames(options: RobotCarTwinOptions) -> RobotCarFrames:
-    """Choose all images of the twin; equal options give equal images."""
+    """Choose all images of the twin, deterministically."""
     mapping: list[Frame] = []
     queries: list[Frame] = []
     for index in range(options.num_locations):
@@ -188,7 +189,7 @@ def _reference_frames(options: RobotCarTwinOptions, place: Place) -> list[Frame]
 def _query_frames(
     options: RobotCarTwinOptions, place: Place, map_views: list[CoarseView], condition: str
 ) -> list[Frame]:
-    """Choose this location's share of a traversal's moments."""
+    """Choose the moments of a traversal in one location."""
     azimuth = float(stream(options.seed, "robotcar", condition, place.index).uniform(-np.pi, np.pi))
     frames = []
     for number in range(place.index, options.moments_per_condition, options.num_locations):
@@ -245,7 +246,7 @@ def _query_poses(
     map_views: list[CoarseView],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, RigidTransform]]:
-    """Yield ``car_from_place`` near the reference traversal, each with the misfit of the scored
+    """Yield ``car_from_place`` near the reference traversal, preceded by the misfit of the scored
     camera's view."""
     camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], CAM_FROM_CAR[SCORED_CAMERA]
     path = place.plan.stops(_STEPS)
@@ -271,7 +272,7 @@ def _car_from_place(
 
 
 def _registered(frames: Sequence[Frame]) -> list[Frame]:
-    """Return the reference images in the models: one per location is omitted."""
+    """Return the reference images in the models, all but one per location."""
     last = {frame.place: frame.timestamp for frame in frames}
     return [
         frame
@@ -283,7 +284,7 @@ def _registered(frames: Sequence[Frame]) -> list[Frame]:
 def _write_models(
     layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], drawn: MapFrames
 ) -> None:
-    """Write one model per location, and a merged one, in the same world."""
+    """Write one model per location and a merged model, in the same coordinates."""
     places = np.array([frame.place for frame in frames])
     parts = []
     for place in range(options.num_locations):
@@ -326,7 +327,7 @@ def _write_car(layout: Layout, options: RobotCarTwinOptions) -> None:
 
 
 def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
-    """Write the queries of all cameras, with the various line ends of the published files."""
+    """Write the queries of all cameras, with the various line breaks of the published files."""
     for place in sorted({frame.place for frame in queries}):
         names = [frame.name for frame in queries if frame.place == place]
         path = layout.query_list(_location(place))
@@ -341,14 +342,14 @@ def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
 def _write_version_2(
     layout: Layout, options: RobotCarTwinOptions, queries: Sequence[Frame]
 ) -> None:
-    """Write half of each traversal's moments with poses, half without; a few are in neither
-    list."""
+    """Write version 2's lists: half of each traversal's moments with poses, half without; a few
+    moments are in neither list."""
     train: list[Frame] = []
     test: list[Frame] = []
     scored = [frame for frame in queries if frame.sensor_id == SCORED_CAMERA]
     for condition in dict.fromkeys(frame.condition for frame in scored):
         here = [frame for frame in scored if frame.condition == condition]
-        # by turns, so that both lists have moments of all locations
+        # alternately, so that both lists have moments of all locations
         listed = here[:-1] if condition in _UNLISTED_CONDITIONS else here
         train += listed[::2]
         test += listed[1::2]

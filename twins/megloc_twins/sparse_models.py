@@ -1,8 +1,8 @@
 """Sparse models of a rendered world: exact tracks, or triangulated SIFT features.
 
 The official layouts include a model. Exact points are lifted from rendered depth and projected, so
-the model is as exact as float32 pixels allow. SIFT models have known poses, cameras and matches,
-but points and keypoints with the errors of real ones.
+the model is as exact as float32 pixels allow. SIFT models have exact poses, cameras and matches,
+but points and keypoints with realistic errors.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ from megloc_twins.options import JPEG_QUALITY, ModelTwinOptions
 from megloc_twins.rasterization import intrinsics, project, sample_grid
 from megloc_twins.render import RenderedFrame, render_frames
 
-_BORDER_PX = 2.0  # no feature nearer to the border
-# between a point's depth and that of the pixel it falls into; surfaces seen at a slant need it
+_BORDER_PX = 2.0  # smallest distance of a feature from the image border
+# tolerated difference of a point's depth from its pixel's, relative plus absolute; slanted
+# surfaces need it
 _DEPTH_TOLERANCE = 0.01
 _DEPTH_TOLERANCE_M = 0.02
-_GREY = 128  # the depth knows no colour
+_GREY = 128  # depth maps have no colours
 _MATCHING = NearestNeighbourOptions(max_ratio=0.8)  # as COLMAP's matcher
 _MAX_ERROR_PX = 2.0
-_MIN_SHARED = 20  # features of one image that have one of the other at the same place
+_MIN_SHARED = 20  # images are matched if at least this many features are visible in both
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -58,20 +59,21 @@ def exact_tracks(
 ) -> SparsePoints:
     """Create sparse points seen in at least two frames, with exact observations.
 
-    Pixels with depth are drawn at random in every frame, lifted to the frame of the frames' poses
-    and projected into all frames of the same place whose depth agrees.
+    Pixels with depth are drawn at random in every frame, lifted to world points and projected into
+    all frames of the same place whose depth agrees.
 
     Parameters
     ----------
     frames : PINHOLE, SIMPLE_PINHOLE or SIMPLE_RADIAL cameras.
-    depths_m : float32 (H, W) along the optical axis by image name, one for each frame, 0 where
-        nothing is seen.
-    points_per_frame : pixels drawn in each frame; those that no other frame sees give no point.
+    depths_m : float32 (H, W) along the optical axis by image name, one for each frame, 0 without a
+        surface.
+    points_per_frame : number of pixels drawn in each frame; a pixel that no other frame sees gives
+        no point.
 
     Returns
     -------
-    ``xyz`` in the frame of the frames' poses, all grey; observations sorted by point, then image;
-    ``image_ids`` count in ``frames``, ``feature_ids`` from 0 in each image; ``xy_px`` are the
+    Grey points with ``xyz`` in the world of the poses and observations sorted by point, then image.
+    ``image_ids`` index ``frames``, ``feature_ids`` count from 0 in each image, ``xy_px`` are the
     projections rounded to float32.
     """
     parts = [SparsePoints.none()]
@@ -142,9 +144,9 @@ def _observations(
 
 
 def _in_field(camera: Camera, in_camera: Floats) -> Bools:
-    """Select points ahead of the camera, no farther from the axis than the image's corners.
+    """Select points in front of the camera, no farther from its axis than the image's corners.
 
-    Beyond the corners the distortion need not be monotonic and may fold a point into the image.
+    Beyond the corners the distortion may be non-monotonic and project a point into the image.
     """
     z = in_camera[:, 2]
     inside = (in_camera[:, :2] ** 2).sum(1) <= _squared_reach(camera) * z**2
@@ -159,17 +161,17 @@ def _squared_reach(camera: Camera) -> float:
 
 
 def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -> SparsePoints:
-    """Triangulate points from similar features that see the same spot.
+    """Triangulate points from matches of features of the same surface point.
 
     Parameters
     ----------
     features, depths_m : of each frame by image name; depth float32 (H, W) along the optical axis, 0
-        where nothing is seen.
+        without a surface.
 
     Returns
     -------
-    ``xyz`` in the frame of the frames' poses, all grey; at least three images see a point;
-    ``image_ids`` count in ``frames``, ``feature_ids`` are rows of the features.
+    Grey points with ``xyz`` in the world of the poses, each observed by at least three images.
+    ``image_ids`` index ``frames``, ``feature_ids`` are rows of the features.
     """
     images = [
         MapImage(frame.name, frame.camera, frame.cam_from_world, features[frame.name].keypoints_px)
@@ -191,7 +193,7 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
 
 
 def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Features) -> None:
-    """Write a COLMAP database of the frames' features, sorted by name; equal cameras are shared."""
+    """Write a COLMAP database of the frames' features; frames with equal cameras share one."""
     pycolmap = load_pycolmap()
     path.parent.mkdir(parents=True, exist_ok=True)
     camera_ids: dict[Camera, int] = {}
@@ -251,15 +253,15 @@ def _near(
     """Select matches whose first feature's point projects to the second feature."""
     px = px_from_cam(frame.camera, frame.cam_from_world.apply(world[matches[:, 0]]))
     error = np.linalg.norm(px - features.keypoints_px[matches[:, 1]], axis=1)
-    return np.asarray(error <= _MAX_ERROR_PX)  # NaN is not
+    return np.asarray(error <= _MAX_ERROR_PX)  # False for NaN
 
 
 @dataclass(frozen=True, eq=False)
 class MapFrames:
     """Depth and features of the rendered map images, by image name.
 
-    ``depths_m`` are float32 (H, W) along the optical axis, 0 without a surface; ``features``
-    COLMAP's SIFT, none where the models' points are to be exact.
+    ``depths_m`` are float32 (H, W) along the optical axis, 0 without a surface. ``features`` are
+    COLMAP's SIFT, empty if the models have exact points.
     """
 
     depths_m: Depths
@@ -267,7 +269,7 @@ class MapFrames:
     points_per_image: int
 
     def points(self, frames: Sequence[Frame], rng: np.random.Generator) -> SparsePoints:
-        """Return :func:`sift_points` with features, else :func:`exact_tracks`."""
+        """Return :func:`sift_points` if there are features, else :func:`exact_tracks`."""
         if self.features:
             return sift_points(frames, self.features, self.depths_m)
         count = self.points_per_image
@@ -281,7 +283,7 @@ def render_map_and_queries(
     images: Path,
     work: Work,
 ) -> MapFrames:
-    """Render all frames and write them below ``images`` under their names."""
+    """Render all frames and write them, by name, below ``images``."""
     names = frozenset(frame.name for frame in mapping)
     finish = partial(_write, images, names if options.model_features else frozenset())
     frames = [*mapping, *others]
@@ -298,6 +300,6 @@ def _write(
 ) -> tuple[Depth | None, LocalFeatures | None]:
     path = images / frame.name
     write_image(path, view.image, jpeg_quality=JPEG_QUALITY)
-    # of the image as it was written
+    # features are extracted from the written image, with its JPEG artefacts
     wanted = frame.name in with_features
     return view.depth_m, ColmapSift().extract(read_image_rgb(path)) if wanted else None

@@ -1,4 +1,4 @@
-"""Places: squares and streets a few metres across, laid out and furnished from a seed.
+"""Places: squares and streets, about twenty metres across, laid out and furnished from a seed.
 
 A place has a frame (metres, z up, ground at z = 0, origin near its centre) with a pose in the
 world. Places of one world share materials, windows, doors and posters, which makes retrieval and
@@ -24,7 +24,7 @@ from megloc_twins.textures import GROUND_TEXELS_PER_M, TextureRecipe, index_of, 
 Point = tuple[float, float]
 TexturePicker = Callable[[str], int]
 
-# furniture: radius of the circle a kind needs, metres, and how often it is chosen
+# furniture: radius of the required circle, metres, and probability
 _FURNITURE = {
     "crates": (0.9, 0.35),
     "pillar": (0.65, 0.25),
@@ -33,10 +33,10 @@ _FURNITURE = {
 }
 _MAX_FURNITURE = 8
 
-_PLACE_DISTANCE_M = 90.0  # between the middles of neighbours, before each is moved a little
+_PLACE_DISTANCE_M = 90.0  # between centres of neighbouring places, before a random shift
 _WALL_TEXELS_PER_M = 100
 _MATERIALS = ("brick", "stone", "plaster")
-_TEXTURES = {  # width, height in texels; numbers that all places share and that a place adds
+_TEXTURES = {  # width, height in texels; number of shared textures and of those of each place
     "window": (156, 192, 3, 3),
     "door": (132, 270, 2, 3),
     "shutter": (240, 300, 1, 2),
@@ -50,7 +50,7 @@ _TEXTURES = {  # width, height in texels; numbers that all places share and that
 _GROUND_STOREY_M, _UPPER_STOREY_M, _CORNICE_M = 3.3, 2.9, 0.35
 _EAVES_M = _GROUND_STOREY_M + _UPPER_STOREY_M
 _WALL_HEIGHT_M = _EAVES_M + _CORNICE_M
-# what is in a bay of the ground floor: how often, half its width, from where to where it reaches
+# contents of a bay of the ground floor: probability; half the width, lower and upper edge, metres
 _BAYS = {
     "window": (0.3, 0.65, 0.95, 2.45),
     "door": (0.2, 0.55, 0.0, 2.25),
@@ -61,7 +61,7 @@ _BAYS = {
 
 @dataclass(frozen=True, eq=False)
 class Furniture:
-    """Add furniture of a kind at a point (x, y metres); ``pick`` returns a texture of a kind."""
+    """Builder of furniture at a point (x, y in metres); ``pick`` returns a texture of a kind."""
 
     builder: SurfaceBuilder
     rng: np.random.Generator
@@ -210,13 +210,13 @@ class Facade:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One place, in its frame."""
+    """A place; geometry is in the place's frame."""
 
     index: int  # in its world
-    recipes: tuple[TextureRecipe, ...]  # its textures, the moving objects' first
-    surfaces: Surfaces  # ``texture`` counts in ``recipes``
+    recipes: tuple[TextureRecipe, ...]  # its textures, those of moving objects first
+    surfaces: Surfaces  # ``texture`` indexes ``recipes``
     lamps: NDArray[np.float64]  # (L, 3), sources of light at night
-    plan: FloorPlan  # where one can stand
+    plan: FloorPlan  # free ground
     place_from_world: RigidTransform
 
     @property
@@ -225,11 +225,11 @@ class Place:
         return f"place{self.index}"
 
     def cam_from_place(self, frame: Frame) -> RigidTransform:
-        """Return the world pose of a frame of this place."""
+        """Return the pose of a frame relative to this place."""
         return frame.cam_from_world @ self.place_from_world.inverse()
 
     def surfaces_in_world(self) -> Surfaces:
-        """Return its geometry in the world frame."""
+        """Return the surfaces in the world frame."""
         world_from_place = self.place_from_world.inverse()
         return self.surfaces.moved(
             world_from_place.rotation_matrix(), np.array(world_from_place.translation)
@@ -238,7 +238,7 @@ class Place:
 
 @dataclass
 class _TextureStore:
-    """Textures of a place by recipe, drawn from shared ones and from ones of this place alone."""
+    """Textures of a place by recipe, some of them shared by all places."""
 
     options: SyntheticWorldOptions
     place: int
@@ -297,7 +297,7 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
 
 
 def _place_from_world(rng: np.random.Generator, index: int, num_places: int) -> RigidTransform:
-    """Return the poses of places on a loose grid, each rotated at random."""
+    """Return ``place_from_world`` of a place on a loose grid, with a random rotation."""
     columns = int(np.ceil(np.sqrt(num_places)))
     middle = np.array([index % columns, index // columns, 0.0]) * _PLACE_DISTANCE_M
     middle += np.array([*rng.uniform(-8, 8, 2), rng.uniform(-1, 1)])
@@ -311,7 +311,7 @@ def about_z(angle: float) -> NDArray[np.float64]:
 
 
 def _furnished(plan: FloorPlan, furniture: Furniture) -> FloorPlan:
-    """Add furniture to the plan, clear of the walls, the rig's path and each other."""
+    """Add furniture that does not touch walls, the rig's path or other furniture to the plan."""
     rng = furniture.rng
     placed: list[Obstacle] = []
     low, high = plan.outline.min(0), plan.outline.max(0)

@@ -1,4 +1,4 @@
-"""Textured, one-sided parallelograms: boxes and walls; the texture atlas."""
+"""Textured, one-sided parallelograms; boxes and walls of them; their texture atlas."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Span = tuple[float, float]
 Part = tuple[float, float, float, float]  # u0, v0, u1, v1 of a texture
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
 
-NUM_LEVELS = 7  # each half the size of the one before
+NUM_LEVELS = 7  # each half the size of the previous level
 ATLAS_WIDTH = 4096
-_BORDER = 2  # texels repeated around each level: bilinear lookups at the edge stay inside
+_BORDER = 2  # repeated edge texels around each level, for bilinear interpolation
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
     """N textured parallelograms.
 
-    Seen from its front, ``edge_u`` runs along the texture's rows and ``edge_v`` down its columns;
-    ``edge_u x edge_v`` points away from the viewer. Metres.
+    In front view, ``edge_u`` points along the texture's rows and ``edge_v`` down its columns;
+    ``edge_u x edge_v`` points away from the viewer. In metres.
     """
 
     origin: Vector  # (N, 3), the corner where the texture begins
@@ -34,7 +34,7 @@ class Surfaces:
     edge_v: Vector  # (N, 3)
     texture: NDArray[np.int32]  # (N,), index of the texture
     uv: Vector  # (N, 4): the part (u0, v0, u1, v1) of the texture shown, 0..1
-    glow: NDArray[np.float32]  # (N,), emitted light at night, relative to its colour
+    glow: NDArray[np.float32]  # (N,), emitted light at night, relative to the colour
 
     def __len__(self) -> int:
         return len(self.texture)
@@ -110,7 +110,7 @@ class SurfaceBuilder:
             corner = middle + distance * outward - half_width * right + height * up
             self.add(corner, 2 * half_width * right, -height * up, texture, uv=uv, glow=glow)
             right, outward, half_width, distance = -outward, right, distance, half_width
-        # from above, with the texture's columns running towards -y
+        # seen from above, the texture's columns point towards -y
         corner = middle - half_x * along + half_y * across + height * up
         self.add(corner, 2 * half_x * along, -2 * half_y * across, top, glow=glow)
         if bottom is not None:
@@ -132,7 +132,7 @@ class SurfaceBuilder:
         )
 
 
-PASSAGE = -1  # the texture of an opening one can go through
+PASSAGE = -1  # texture of an opening without window or door
 
 
 @dataclass(frozen=True)
@@ -150,11 +150,11 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """Frame of a wall, which runs from ``start`` to the right, seen from inside the place."""
+    """Frame of a wall, which extends from ``start`` to the right, seen from inside the place."""
 
-    start: Vector  # (3,), foot of its left end, metres
-    right: Vector  # (3,), a unit vector
-    inward: Vector  # (3,), a unit vector, points to the viewer
+    start: Vector  # (3,), lower left corner, metres
+    right: Vector  # (3,), unit vector
+    inward: Vector  # (3,), unit vector towards the viewer
     length: float  # metres
     texture: int  # of the wall itself, stretched over its length and height
     trim: int  # texture of ledges, reveals and pilasters
@@ -169,7 +169,7 @@ class Wall:
         return cls(np.array([*start, 0.0]), right, inward, length, texture, trim, height)
 
     def point(self, x: float, y: float, out: float = 0.0) -> Vector:
-        """Return the world position of ``x`` along, ``y`` up and ``out`` of the wall, metres."""
+        """Return the point at ``x`` along, ``y`` above the foot and ``out`` of the wall, metres."""
         return self.start + x * self.right + out * self.inward + np.array([0.0, 0.0, y])
 
     def rectangle(
@@ -220,8 +220,8 @@ class Wall:
     def storey(self, builder: SurfaceBuilder, y: Span, openings: Iterable[Opening] = ()) -> None:
         """Add the wall between two heights, with openings that do not overlap.
 
-        An opening has reveals and a window or door at its back. A passage is see-through; its
-        reveals belong to one of its sides.
+        An opening has reveals, and a window or door at its back. A passage has no back; it has
+        reveals on one of the wall's sides only.
         """
         x = 0.0
         for hole in sorted(openings, key=lambda o: o.x0):
@@ -246,7 +246,7 @@ class Atlas:
     """Textures with their pyramid levels, packed in one image."""
 
     image: NDArray[np.uint8]  # (H, ATLAS_WIDTH, 3), RGB
-    corner: NDArray[np.float32]  # (T, NUM_LEVELS, 2): x, y of a level's upper left corner in it
+    corner: NDArray[np.float32]  # (T, NUM_LEVELS, 2): x, y of a level's upper left corner
     size: NDArray[np.float32]  # (T, NUM_LEVELS, 2): width and height of a level, texels
 
 
@@ -263,7 +263,7 @@ def build_atlas(textures: Sequence[NDArray[np.uint8]]) -> Atlas:
     widths = np.array([piece.shape[1] for piece in levels]) + 2 * _BORDER
     corner = np.zeros((len(levels), 2), np.int64)
     x = y = shelf = 0
-    for index in np.argsort(-heights, kind="stable"):  # shelves, highest first
+    for index in np.argsort(-heights, kind="stable"):  # in rows, tallest textures first
         if x + widths[index] > ATLAS_WIDTH:
             x, y, shelf = 0, y + shelf, 0
         corner[index] = (x + _BORDER, y + _BORDER)

@@ -1,4 +1,4 @@
-"""The synthetic world as plain kapture: mapped by a rig, queried by phones, day and night."""
+"""The synthetic world as plain kapture: map images of a rig, queries of phones by day and night."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ _RIG_ID = "rig"
 _BONNET_SENSOR = "rig_front"
 
 
-# the rig looks along z, y down, metres
+# rig axes: x right, y down, z forward; metres
 SENSOR_FROM_RIG = {
     "rig_front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
     "rig_left": cam_from_rig(-62.0, 3.0, (-0.35, 0.0, 0.05)),
     "rig_right": cam_from_rig(62.0, 3.0, (0.35, 0.0, 0.05)),
 }
-_LENSES = {  # focal length and principal point, shares of the width and height
+_LENSES = {  # focal length and principal point, as fractions of width and height
     "rig_front": (0.76, 0.5, 0.5),
     "rig_left": (0.73, 0.506, 0.493),
     "rig_right": (0.73, 0.494, 0.507),
@@ -66,7 +66,7 @@ def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
 def _mapping_frames(
     options: SyntheticWorldOptions, place: Place, rig_from_world: dict[int, RigidTransform]
 ) -> list[Frame]:
-    """Return the rig's frames at its stops in a place, in order of time; add its poses there."""
+    """Return the rig's frames in a place by time; add the rig's poses to ``rig_from_world``."""
     rng = stream(options.seed, "mapping", place.index)
     sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60)))
     frames = []
@@ -115,9 +115,9 @@ class SyntheticWorld:
         return self.mapping + self.queries
 
     def coarse_views(self) -> dict[str, CoarseView]:
-        """Return a coarse view of every frame, without moving objects, by image name; world frame.
+        """Return a coarse view of every frame by image name, in the world, without moving objects.
 
-        :func:`overlap` of two views shows if a query shares anything with a map image.
+        :func:`overlap` of two views tests whether a query and a map image show the same surfaces.
         """
         surfaces = [place.surfaces_in_world() for place in self.places]
         return {
@@ -127,7 +127,7 @@ class SyntheticWorld:
 
 
 def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
-    """Lay out the world and choose all frames; equal options give equal worlds."""
+    """Lay out the world and choose all frames, deterministically."""
     options = options or SyntheticWorldOptions()
     places = tuple(build_place(options, index) for index in range(options.num_places))
     rig_from_world: dict[int, RigidTransform] = {}
@@ -150,8 +150,8 @@ def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
 class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
     """The synthetic world as plain kapture.
 
-    ``mapping/`` (images, poses through the rig, depth if asked), ``query/`` (images and cameras),
-    ``query_gt/`` (the same cameras with poses, no images) and ``megloc/`` (day and night,
+    ``mapping/`` (images, poses of the rig, depth on request), ``query/`` (images and cameras),
+    ``query_gt/`` (the same cameras with poses, without images) and ``megloc/`` (conditions,
     thresholds).
     """
 
@@ -179,7 +179,7 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
 
 
 def mapping_data(world: SyntheticWorld) -> KaptureData:
-    """Return the records of the mapping images; their poses are the rig's."""
+    """Return the records of the mapping images, with poses of the rig."""
     data = KaptureData()
     members = dict(SENSOR_FROM_RIG)
     for sensor_id, camera in rig_cameras(world.options).items():
@@ -200,7 +200,7 @@ def mapping_data(world: SyntheticWorld) -> KaptureData:
 
 
 def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
-    """Write the queries' conditions, the thresholds and the frame."""
+    """Write the queries' conditions, the thresholds and the world frame."""
     groups = {
         frame.name: ImageGroup(condition=frame.condition, location=world.places[frame.place].name)
         for frame in world.queries

@@ -1,8 +1,8 @@
-"""Textures of houses, ground and things, painted from a seed.
+"""Textures of houses, ground and objects, painted from a seed.
 
 Every painter is a function ``(rng, height, width, **params) -> uint8 (height, width, 3)`` RGB.
-A :class:`TextureRecipe` names a painter with its size and seed, so that a world is laid out without
-painting it, and two surfaces with the same recipe look the same.
+A :class:`TextureRecipe` has a painter's name, a size and a seed, so that a world can be laid out
+without painting it. Surfaces with the same recipe look the same.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def paint_ground(
     for _ in range(2 + int(area_m2 / 60)):
         size = int(0.7 * density)
         x, y = int(rng.uniform(0, width - size)), int(rng.uniform(0, height - size))
-        # all of one kind, like the paving
+        # all manholes of a material look alike
         image[y : y + size, x : x + size] = _manhole(stream(int(material_seed), "manhole"), size)
     for _ in range(int(area_m2 / 50)):
         start = rng.uniform((0, 0), (width, height))
@@ -135,7 +135,7 @@ def _manhole(rng: Generator, size: int) -> Rgb:
 
 
 def paint_window(rng: Generator, height: int, width: int) -> Rgb:
-    """Paint a window: frame, panes and things behind them."""
+    """Paint a window: frame, panes and objects behind them."""
     frame = random_colour(rng, 90, 235, chroma=0.35)
     glass = np.array([58, 72, 88], np.float32) * rng.uniform(0.6, 1.3)
     ramp = np.linspace(1.35, 0.7, height, dtype=np.float32)[:, None]
@@ -147,7 +147,7 @@ def paint_window(rng: Generator, height: int, width: int) -> Rgb:
         cloth = random_colour(rng, 110, 220, chroma=0.4) * folds[:, None]
         image[:, :part] = cloth.clip(0, 255).astype(np.uint8)
         image[:, width - part :] = image[:, :part][:, ::-1]
-    for _ in range(int(rng.integers(1, 4))):  # plants, lamps, vases on the sill
+    for _ in range(int(rng.integers(1, 4))):  # plants, lamps and vases on the sill
         x, w = int(rng.uniform(0.1, 0.8) * width), int(rng.uniform(0.08, 0.2) * width)
         h = int(rng.uniform(0.1, 0.35) * height)
         colour = cv_colour(random_colour(rng))
@@ -188,7 +188,7 @@ def paint_door(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def _planks(rng: Generator, count: int, texels: int, *, seam: float) -> NDArray[np.float64]:
-    """Return tones of adjacent boards (texels,), with a dark seam at the beginning of each."""
+    """Return the tones (texels,) of adjacent boards, each with a dark seam at its beginning."""
     tone = rng.normal(1, 0.12, count).astype(np.float32)
     at = np.arange(texels)
     seams = np.where((at * count % texels) < count * 2, seam, 1.0)
@@ -196,7 +196,7 @@ def _planks(rng: Generator, count: int, texels: int, *, seam: float) -> NDArray[
 
 
 def paint_shutter(rng: Generator, height: int, width: int) -> Rgb:
-    """Paint a rolling shutter: horizontal slats, with a graffito."""
+    """Paint a rolling shutter: horizontal slats with graffiti."""
     base = random_colour(rng, 110, 200, chroma=0.3)
     slats = 1 + 0.18 * sin(np.arange(height) * (2 * np.pi / 11))
     dirt = 1 + 0.09 * smooth_noise(rng, height, width, cell=40, octaves=4)
@@ -207,7 +207,7 @@ def paint_shutter(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_plain(rng: Generator, height: int, width: int) -> Rgb:
-    """Paint a plain surface: ledges, pipes, reveals."""
+    """Paint a plain surface, for ledges, pipes and reveals."""
     base = np.full(3, rng.uniform(80, 190), np.float32)
     base *= rng.uniform(0.92, 1.08, 3).astype(np.float32)
     field = 1 + 0.09 * smooth_noise(rng, height, width, cell=32, octaves=5)

@@ -1,4 +1,4 @@
-"""Viewpoints of queries: away from the map's cameras, but supported by its images."""
+"""Viewpoints of queries: away from the map's cameras, but covered by its images."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from megloc_twins.squares import Place
 from megloc_twins.surfaces import Surfaces
 
 _DEPTH_TOLERANCE = 0.05  # relative; the other view's depth is read at the nearest coarse pixel
-# what SIFT bears between two views of a point: angle between the rays, ratio of sizes and of
-# foreshortenings
+# largest differences of two views of a point that SIFT can match: angle between the rays, ratio of
+# sizes and of foreshortenings
 _MAX_ANGLE_DEG = 32.0
 _MAX_SIZE_RATIO = 2.0
-_MIN_BASELINE_DEG = 1.5  # less gives a point without depth
+_MIN_BASELINE_DEG = 1.5  # smallest triangulation angle of a point
 
-_MAX_OVERLAP = 0.85  # no query is a copy of a mapping image
-_MIN_SUPPORT = 0.6  # share of a query's view that the map can tell it
+_MAX_OVERLAP = 0.85  # with any map image, so that no query is almost a copy
+_MIN_SUPPORT = 0.6  # share of a query's view that the map covers
 _ATTEMPTS = 300
 
 Item = TypeVar("Item")
@@ -68,7 +68,11 @@ def coarse_view(
     reduction: int = 8,
     stride: int = 4,
 ) -> CoarseView:
-    """Look at surfaces coarsely: px per px of ``depth``, and of that per point and axis."""
+    """Return a coarse view of surfaces.
+
+    ``depth`` is smaller than the image by ``reduction`` per axis; points are from every
+    ``stride``-th row and column of it.
+    """
     grid = sample_grid(reduced(camera, reduction), 1)
     seen = visible_surfaces(surfaces, cam_from_world, grid)
     depth = depth_map(seen)
@@ -94,15 +98,15 @@ def visible(points: Floats, view: CoarseView) -> Bools:
 
 
 def overlap(view: CoarseView, other: CoarseView) -> float:
-    """Return the share (0..1) of ``view`` that ``other`` also sees."""
+    """Return the share (0..1) of points of ``view`` that ``other`` also sees."""
     return float(visible(view.points, other).mean()) if len(view.points) else 0.0
 
 
 def support(view: CoarseView, others: Sequence[CoarseView]) -> float:
-    """Return the share (0..1) of ``view`` that a map of the ``others`` covers.
+    """Return the share (0..1) of points of ``view`` that a map of the views ``others`` covers.
 
-    A point counts if another view sees it similarly enough to match, and a third view can
-    triangulate it.
+    A point counts if one of the others sees it similarly enough to match, and a further view
+    triangulates it.
     """
     if not len(view.points) or len(others) < 2:
         return 0.0
@@ -118,7 +122,7 @@ def support(view: CoarseView, others: Sequence[CoarseView]) -> float:
 
 
 def _aspect(points_of: CoarseView, view: CoarseView) -> tuple[Floats, Floats, Floats]:
-    """Return how ``view`` sees the points of another: unit rays (P, 3), sizes and slants (P,)."""
+    """Return unit rays (P, 3), sizes and slants (P,) of a view's points as seen in ``view``."""
     difference = points_of.points - view.cam_from_world.center()
     distance = np.linalg.norm(difference, axis=1)
     rays = difference / distance[:, None]
@@ -139,8 +143,8 @@ def query_frames(
     condition: Condition,
     total: int,
 ) -> list[Frame]:
-    """Choose this place's share of the ``total`` queries of a condition; ``mapping`` are its map
-    images."""
+    """Choose the queries of a condition in one place, out of ``total`` in all places; ``mapping``
+    are the map images."""
     map_views = views_of(place, mapping)
     frames = []
     for number in range(place.index, total, options.num_places):
@@ -172,14 +176,14 @@ def query_frames(
 
 
 def views_of(place: Place, frames: Iterable[Frame]) -> list[CoarseView]:
-    """Return coarse views of a place's images, in the place's frame."""
+    """Return coarse views of the frames of a place, in the place's coordinates."""
     return [
         coarse_view(place.surfaces, frame.camera, place.cam_from_place(frame)) for frame in frames
     ]
 
 
 def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Camera:
-    """Draw a phone's camera, with focal length, principal point and distortion."""
+    """Draw a phone's camera: focal length, principal point and distortion."""
     width, height = options.width, options.height
     focal = rng.uniform(0.7, 0.95) * width
     cx, cy = width / 2 + rng.normal(0, 2), height / 2 + rng.normal(0, 2)
@@ -198,9 +202,9 @@ def _query_lighting(
 def _query_poses(
     place: Place, camera: Camera, map_views: list[CoarseView], rng: np.random.Generator
 ) -> Iterator[tuple[float, tuple[Floats, float, RigidTransform]]]:
-    """Yield random viewpoints away from obstacles, each after its :func:`misfit`.
+    """Yield the :func:`misfit` of random viewpoints away from obstacles, and the viewpoint.
 
-    A viewpoint has a position (3,), a yaw and ``cam_from_place``.
+    A viewpoint is a position (3,), a yaw and ``cam_from_place``.
     """
     low, high = place.plan.outline.min(0), place.plan.outline.max(0)
     for _ in range(_ATTEMPTS):
@@ -218,9 +222,9 @@ def _query_poses(
 
 
 def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: float = 0.0) -> float:
-    """Measure how much a view lacks support by the map, or copies one of its images; 0 is good.
+    """Measure by how much a view lacks support by the map or repeats a map image; 0 is good.
 
-    Map images with an overlap up to ``min_overlap`` give no support.
+    Map images with an overlap of at most ``min_overlap`` give no support.
     """
     shares = [overlap(view, other) for other in map_views]
     seen = [o for o, share in zip(map_views, shares, strict=True) if share > min_overlap]
@@ -228,10 +232,9 @@ def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: fl
 
 
 def first_fitting(candidates: Iterable[tuple[float, Item]], place: str) -> Item:
-    """Return the first candidate of (misfit, candidate) with misfit 0, else the first with the
-    least.
+    """Return the first candidate of (misfit, candidate) with misfit 0, else that with the least.
 
-    Only as many as needed are drawn.
+    Candidates after it are not drawn.
     """
     best: tuple[float, Item] | None = None
     for candidate in candidates:
