@@ -150,7 +150,7 @@ def write_vocabulary(
 
 
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
-    """Read the vocabulary of a global feature type, or None."""
+    """Read the vocabulary and the settings of a VLAD type; None if they are missing."""
     if not (folder / SETTINGS_FILE).is_file():
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)

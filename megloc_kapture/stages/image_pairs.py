@@ -419,7 +419,7 @@ class RerankingOptions(Options):
         description="local features whose matches count, by type or plugin; none: all types "
         "together",
     )
-    keep: int = Field(default=20, gt=0, description="number of candidates kept, N")
+    keep: int = Field(default=20, gt=0, description="number of candidates to keep, the paper's N")
 
     def reranks(self) -> bool:
         return self.by != "none"

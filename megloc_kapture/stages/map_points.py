@@ -1,4 +1,4 @@
-"""Stage: map points, triangulated from matches, or lifted: backprojected with depth maps."""
+"""Stage: map points, triangulated from matches, or lifted (backprojected with depth maps)."""
 
 from __future__ import annotations
 

@@ -154,7 +154,7 @@ class StageWork(Work):
         return KaptureFolder(self.path(name), features_dirs=[self.path(part) for part in features])
 
     def folders(self, names: Sequence[str], *features: str) -> list[KaptureFolder]:
-        """Open those of these kapture folders that exist."""
+        """Open the kapture folders of these names; skip missing folders."""
         return [self.folder(name, *features) for name in names if self.path(name).is_dir()]
 
 
