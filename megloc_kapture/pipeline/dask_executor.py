@@ -1,7 +1,7 @@
 """Executor on a running dask.distributed cluster, or on a local one.
 
-Items are paths and numbers and workers read the files, so the workspace, the data and the current
-folder must have the same paths on every machine.
+Items contain only paths and numbers, and the workers read the files. Therefore the workspace, the
+data and the current folder must have the same paths on every machine.
 """
 
 from __future__ import annotations
@@ -55,11 +55,12 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             client.register_plugin(_Preparation(Path.cwd(), shared.absolute()))
             executor: Any = client.get_executor(pure=False)
             executor.window = _ITEMS_PER_WORKER * threads
-            executor.is_elsewhere = scheduler is not None  # remote machines may have GPUs
+            # workers of a scheduler may be on other machines, with GPUs of those machines
+            executor.is_elsewhere = scheduler is not None
             yield executor
         except KilledWorker as error:
             raise MeglocError(
-                f"an item of work killed {_ALLOWED_FAILURES} workers, perhaps out of memory; "
+                f"one work item killed {_ALLOWED_FAILURES} workers, perhaps out of memory; "
                 "try fewer workers per machine"
             ) from error
         except ModuleNotFoundError as error:

@@ -79,13 +79,13 @@ class DatasetChoice:
             (check_root if self.adapter is None else self.adapter.check)(self.root)
 
     def has_truth(self) -> bool:
-        """Return whether the dataset may have true poses; an adapter may know more."""
+        """Return False for kapture folders without true poses, else True (they may have them)."""
         if self.root is None or self.adapter is not None:
             return True
         return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
 
     def has_query_depth(self) -> bool:
-        """Return whether a sensor in the rig gives query depth; False for official datasets."""
+        """Return whether kapture folders have query depth, by a rig; False for other datasets."""
         if self.root is None or self.adapter is not None:
             return False
         return _has_depth(self.root / QUERY)
@@ -125,7 +125,7 @@ class DatasetChoice:
     ) -> dict[str, float]:
         """Import ``root`` into ``output`` and return counts for the log.
 
-        Official datasets get ``megloc/summary.txt``, which compares found and published counts.
+        Official datasets get ``megloc/summary.txt``, which compares actual and published counts.
         """
         if self.adapter is None:
             return import_kapture_folders(
@@ -181,7 +181,7 @@ def choose_dataset(
     allow_missing: bool = False,
     find_root: bool = True,
 ) -> DatasetChoice:
-    """Return a dataset by name; without ``root`` it is searched below MEGLOC_DATA.
+    """Return a dataset by name; without ``root``, its folder is searched below MEGLOC_DATA.
 
     If ``find_root`` is false, an official dataset may lack a root and then cannot be imported.
     """
@@ -204,7 +204,7 @@ def choose_dataset(
 
 
 def with_model(choice: DatasetChoice) -> DatasetChoice | None:
-    """Return the dataset with import of its point model, or None if it has no model."""
+    """Return the dataset with the import of its point model enabled; None if it has no model."""
     if choice.adapter is None:
         return None
     layout = choice.name.removeprefix(TWIN_PREFIX)
@@ -221,7 +221,7 @@ def has_model(choice: DatasetChoice) -> bool:
     try:
         if reference is not None:
             reference.check()
-    except MeglocError:  # :meth:`DatasetChoice.check` passes without the model
+    except MeglocError:  # the model's files are missing: without the model the check has passed
         return False
     return reference is not None
 
@@ -264,7 +264,7 @@ def twin_of(layout: str, **options: Any) -> RenderedDataset:
 
 
 class PresetOptions(Options):
-    """Changes of a dataset to presets, some of them only for data with depth maps."""
+    """Options that a dataset changes in a preset; some only if its data have depth maps."""
 
     import_options: dict[str, Any] = Field(default_factory=dict)
     options: dict[str, Any] = Field(default_factory=dict)
@@ -319,7 +319,7 @@ class BenchmarkFile(PresetOptions):
 
 
 def find_benchmark(dataset: str) -> BenchmarkFile:
-    """Return the packaged benchmark file of a dataset or of a twin's dataset, or defaults."""
+    """Return the packaged benchmark file of a dataset, or of a twin's original, or defaults."""
     for name in (dataset, dataset.removeprefix(TWIN_PREFIX)):
         for place in _PLACES:
             path = place / f"{name}.toml"

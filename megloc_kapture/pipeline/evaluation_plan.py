@@ -98,7 +98,8 @@ class Run:
     def submission_below(self, folder: Path, tables: Path) -> Path:
         """Return the path of the pose file, or of the folder of several, below ``folder``.
 
-        The name is the server's, ``Aachen_v1_1_eval_METHOD.txt``, or begins with ``synthetic-``.
+        The name begins as the server requires, as in ``Aachen_v1_1_eval_METHOD.txt``; for twins and
+        datasets without a server, with the dataset's name.
         """
         protocol = read_protocol(tables)
         stem = self.dataset
@@ -130,7 +131,8 @@ def choose_run(
     Parameters
     ----------
     root : published dataset folder; searched below MEGLOC_DATA by default.
-    assignments : the user's changes: ``key.key=value`` texts, or ``key.key`` to values.
+    assignments : the user's changes: ``key.key=value`` texts, or a mapping from ``key.key`` to
+        values.
     import_options : dataset options, applied after those of the benchmark file.
     config : benchmark file that replaces the packaged one.
     find_root : if false, an official dataset may lack a root and then cannot be imported.
@@ -166,7 +168,7 @@ def choose_run(
 
 
 def _without_covisibility(options: PipelineOptions) -> PipelineOptions:
-    """Drop pairs by co-visibility, which need a reference model, if other pairs remain."""
+    """Drop pairing by co-visibility, which needs a reference model, if another method remains."""
     others = tuple(method for method in options.mapping_pairs.by if method != "covisibility")
     if not others or not options.pairs_by_points():
         return options
@@ -208,11 +210,12 @@ def plan_evaluation(run: Run) -> list[Stage]:
 
 
 def explain(options: PipelineOptions) -> list[dict[str, Any]]:
-    """Return each stage's ``name``, ``on`` if the run includes it, and ``why``."""
+    """Return a row per stage with its ``name``, ``on`` (True if it runs) and ``why`` (options)."""
     rows: dict[str, dict[str, Any]] = {}
     for stage in (kind(options) for kind in PIPELINE):
         on = stage.is_wanted()
-        if on or stage.name not in rows:  # reranking shares a name with what it replaces
+        # without reranking, PairQueries has the name of RerankQueries
+        if on or stage.name not in rows:
             rows[stage.name] = {"name": stage.name, "on": on, "why": stage.explain()}
     return list(rows.values())
 
@@ -248,7 +251,7 @@ def _with_model(run: Run) -> DatasetChoice:
     if source is None:
         raise OptionError(
             f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs its "
-            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' works without'
+            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' needs no model'
         )
     return source
 

@@ -35,8 +35,8 @@ _before = ExitStack()  # restores the thread counts
 def single_threaded() -> Iterator[None]:
     """Limit BLAS, OpenMP and torch to one thread, as executors provide the parallelism.
 
-    The last bits of a product may depend on the number of threads. Several
-    threads may be in such a block at once.
+    The last bits of a matrix product may depend on the number of threads. Several threads may be in
+    this context at once.
     """
     global _num_blocks
     with _lock:
@@ -82,7 +82,7 @@ def _start_worker(log_level: int) -> None:
 
 
 def end_with_parent() -> None:
-    """Stop this process if its parent was killed; a worker would wait for work forever."""
+    """Stop this process if its parent is killed; otherwise a worker would wait for work forever."""
 
     def wait_for_parent() -> None:
         parent = multiprocessing.parent_process()
@@ -133,7 +133,7 @@ def _process_pool(count: int) -> Iterator[Executor]:
         _kill(pool)
         if isinstance(error, BrokenProcessPool):
             raise MeglocError(
-                "a worker process died, perhaps out of memory; try fewer with --workers"
+                "a worker process died, perhaps out of memory; try fewer workers (--workers)"
             ) from error
         raise
     finally:
@@ -144,5 +144,5 @@ def _kill(pool: ProcessPoolExecutor) -> None:
     for process in list((pool._processes or {}).values()):
         process.kill()
     if pool._result_queue is not None:
-        # otherwise the pool's thread waits for the rest of a result
+        # otherwise a thread of the pool waits for the rest of an unfinished result
         pool._result_queue._writer.close()  # type: ignore[attr-defined]

@@ -64,7 +64,8 @@ _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
 class PosedImage:
     """An image with its pose, and a camera in COLMAP's convention.
 
-    ``rows`` and ``points``, int (M,), index ``keypoints_px`` (K, 2) and the scene's points.
+    The observations are ``rows`` of ``keypoints_px`` (K, 2), and ``points``, which are rows of the
+    scene's points; both are int (M,).
     """
 
     name: str
@@ -101,7 +102,7 @@ def export_colmap(scene: Scene, output: Path) -> None:
 def export_undistorted(scene: Scene, output: Path) -> None:
     """Write PINHOLE cameras, ``images/`` and ``sparse/0`` for Gaussian splatting.
 
-    ``/`` in image names becomes ``_``, because the original program ignores folders.
+    ``/`` in image names becomes ``_``, because the original Gaussian splatting ignores folders.
     """
     images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
     for image in images:
@@ -116,13 +117,16 @@ def export_undistorted(scene: Scene, output: Path) -> None:
         undistort_model(model, links, output)
 
 
-def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None) -> None:
-    """Write ``transforms.json``, with paths relative to ``beside``, and ``sparse_pc.ply``."""
+def export_nerfstudio(scene: Scene, output: Path, *, final: Path | None = None) -> None:
+    """Write ``transforms.json`` and ``sparse_pc.ply`` into ``output``.
+
+    Image paths are relative to ``final``, the folder to which ``output`` is moved later.
+    """
     frames = []
     for image in scene.images:
         path = _file_of(image, "nerfstudio")
         world_from_cam = image.cam_from_world.inverse().matrix()
-        file = os.path.relpath(path.resolve(), (beside or output).resolve())
+        file = os.path.relpath(path.resolve(), (final or output).resolve())
         frames.append(
             {
                 "file_path": Path(file).as_posix(),
@@ -162,16 +166,17 @@ def export_tum(scene: Scene, output: Path) -> None:
 
 
 def _exponent_of_seconds(timestamp: int) -> int:
-    """Return the power of ten that converts a timestamp to seconds, recognised by its magnitude.
+    """Return the power of ten that converts a timestamp to seconds.
 
-    Nano-, micro- and milliseconds count from 1970: the limits hold for dates from 1973 to 5138.
+    Milli-, micro- and nanoseconds since 1970 are recognized by their magnitude. The limits hold for
+    dates from 1973 to 5138.
     """
     limits = ((10**17, -9), (10**14, -6), (10**11, -3))
     return next((exponent for limit, exponent in limits if timestamp >= limit), 0)
 
 
 def export_ply(scene: Scene, output: Path) -> None:
-    """Write the points, and every camera as a frustum, a twentieth of the median depth deep."""
+    """Write the points and the camera frusta, whose depth is a twentieth of the median depth."""
     depths = [
         float(np.median(image.cam_from_world.apply(scene.points[image.points, :3])[:, 2]))
         for image in scene.images
@@ -200,8 +205,8 @@ def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDA
 def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
     require(
         camera.model in _NERFSTUDIO,
-        f"nerfstudio has no camera model {camera.model}; undistort first: it also reads what "
-        "`megloc export colmap --undistort` writes",
+        f"nerfstudio has no camera model {camera.model}; undistort first: nerfstudio can read the "
+        "output of `megloc export colmap --undistort`",
     )
     model, names = _NERFSTUDIO[camera.model]
     cx, cy = principal_point_px(camera)
@@ -242,7 +247,7 @@ def export(
     ----------
     name : colmap and nerfstudio write folders, tum and ply files.
     map : kapture map, or a kapture folder of posed images.
-    query : kapture folder of localized queries; a trajectory then holds only these.
+    query : kapture folder of localized queries; a tum trajectory then has only the queries.
     sensor : export only images of this camera.
     undistort : write undistorted images and PINHOLE cameras for Gaussian splatting; colmap only.
     """
@@ -264,7 +269,7 @@ def export(
                 _hint_at_undistort(scene)
                 export_colmap(scene, out)
             else:
-                export_nerfstudio(scene, out, beside=output)
+                export_nerfstudio(scene, out, final=output)
         return len(scene.images)
     if output.exists() and not force:
         raise OutputError(f"{output}: exists; --force overwrites it")
@@ -279,7 +284,7 @@ def _hint_at_undistort(scene: Scene) -> None:
     models = {image.camera.model for image in scene.images}
     if distorted := sorted(models - {"PINHOLE", "SIMPLE_PINHOLE"}):
         _log.warning(
-            "programs for Gaussian splatting refuse %s cameras; --undistort writes PINHOLE "
+            "programs for Gaussian splatting do not support %s cameras; --undistort writes PINHOLE "
             "cameras and images/ for them",
             distorted[0],
         )
@@ -351,7 +356,10 @@ def _posed_images(
 def _observed(
     opened: KaptureMap, image: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return keypoints (K, 2) of all types, and rows (M,) of keypoints and observed points."""
+    """Return keypoints (K, 2) of all types, and the observations as rows of keypoints and points.
+
+    Both arrays of rows are (M,).
+    """
     keypoints, rows, points = [np.zeros((0, 2))], [_NO_ROWS], [_NO_ROWS]
     for typed in opened.keypoints.values():
         if image in typed:

@@ -32,13 +32,13 @@ PixelOriginChoice = Literal["auto", "corner", "centre"]
 
 _SAMPLED_IMAGES = 50
 _NETWORKS = ("aliked", "aslfeat", "disk", "r2d2", "superpoint", "xfeat")
-# SIFT extractors for float (False) and byte (True) descriptors
+# extractor for SIFT descriptors of bytes (True) or floats (False)
 _SIFT_OF = {True: "sift", False: "rootsift"}
 
 
 @dataclass(frozen=True, eq=False)
 class MapKeypoints:
-    """Keypoints of one type in a map, in COLMAP's convention, and the points they observe.
+    """Keypoints of one type in a map, in COLMAP's convention, and the points that they observe.
 
     ``index`` holds points and observations as arrays, empty if the type has no points.
     """
@@ -71,7 +71,7 @@ class MapKeypoints:
         return all(image in self._descriptors for image in images if image in self._keypoints)
 
     def extractor(self) -> PluginChoice | None:
-        """Return the extractor plugin given by the type's name or file, or None."""
+        """Return the extractor plugin named by the type or its ``keypoints.txt``, or None."""
         names = [self.name, base_type(self.name)]
         if self.name in self.folder.types("keypoints"):
             names.append(self._keypoints.config.name)
@@ -89,7 +89,7 @@ class MapKeypoints:
             if image in self._keypoints:
                 check_lengths(self._keypoints, self._descriptors, image)
 
-    # opening a reader lists folders or tar members, so readers are kept
+    # opening a reader lists folders or tar members, so readers are cached
     @cached_property
     def _keypoints(self) -> FeatureReader:
         return self.folder.keypoints(self.name)
@@ -103,8 +103,9 @@ class MapKeypoints:
 class KaptureMap:
     """Read-only map with 3D points, observations and keypoints; see :meth:`open`.
 
-    All coordinates are in COLMAP's convention. ``keypoints`` are the types used for localization,
-    ``restrictions`` the coordinate frames of images and priors of queries of a workspace's map.
+    All coordinates are in COLMAP's convention. ``keypoints`` are the types used for localization.
+    ``restrictions`` are the coordinate frames of map images and the priors of queries, if the map
+    is in a workspace.
     """
 
     folder: KaptureFolder
@@ -202,7 +203,7 @@ class KaptureMap:
         return list(self._global_types)
 
     def check(self) -> None:
-        """Compare the sizes of all feature files used for localization without reading them."""
+        """Check the sizes of all feature files used for localization, without reading the files."""
         for keypoints in self.keypoints.values():
             keypoints.check(self.images)
         for name in self._global_types:
@@ -211,14 +212,14 @@ class KaptureMap:
                 vectors.length(image)
 
     def fault(self) -> str | None:
-        """Return an inconsistency between points and a sample of images' keypoints, or None."""
+        """Return the reason if the map contradicts itself in a sample of its images, or None."""
         for name, keypoints in self.keypoints.items():
             images = [image for image in self.images if image in keypoints]
             # consecutive images, as poses may be shifted by one image
             run, number = 10, _SAMPLED_IMAGES // 10
             starts = np.linspace(0, max(len(images) - run, 0), number).astype(int).tolist()
             taken = sorted({at for start in starts for at in range(start, start + run)})
-            # a pixel origin off by half a pixel is well below the tolerated error
+            # keep stored coordinates: half a pixel of another origin is far below the tolerance
             sample = observed_keypoints(
                 self.folder, keypoints.index, (images[at] for at in taken if at < len(images))
             )
@@ -275,8 +276,9 @@ def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict
 
 
 def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
-    """Return whether the keypoints are certainly in megloc's convention; other toolkits use the
-    same names with the networks' conventions.
+    """Return whether the keypoints are certainly in megloc's convention.
+
+    Other tools use the same type names, but may follow the convention of the network.
     """
     refined = (folder.root / "reconstruction" / REPORT_FILE).is_file()
     name = base_type(local_type)
@@ -287,8 +289,9 @@ def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
 
 
 def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dict[str, PixelOrigin]:
-    """Estimate the pixel origin of the intrinsics, by the type with the most observations, and of
-    each type's keypoints.
+    """Estimate the pixel origins of the intrinsics and of each type's keypoints.
+
+    The origin of the intrinsics is estimated from the type with the most observations.
     """
     origin_of = {name: _find_origin(folder, name, index) for name, index in indices.items()}
     most = max(origin_of, key=lambda name: (len(indices[name].point_ids), name))
@@ -296,7 +299,7 @@ def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dic
     origins = {}
     for name, origin in origin_of.items():
         if origin.intrinsics != intrinsics:
-            # only their difference is measured
+            # the estimate is of the difference only, so equal origins stay equal
             agree = origin.keypoints == origin.intrinsics
             keypoints = intrinsics if agree else origin.keypoints
             reason = f"{origin.reason}; intrinsics from {most}: {intrinsics}"

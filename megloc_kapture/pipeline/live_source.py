@@ -1,4 +1,4 @@
-"""Features, candidates and matches of a query, computed when they are needed."""
+"""Features, candidates and matches of a query, computed on demand."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ _NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32
 class LocalType:
     """A keypoints type of the map, with its extractor and matchers; plugins are loaded lazily.
 
-    ``points`` observe the map's points; ``first`` is matched first and differs from ``points`` in
-    guided pyramids. ``cache`` holds map features, shared with other types.
+    ``points`` are the keypoints that observe map points. ``first`` are the keypoints of the first
+    matching: the same, or in guided pyramids those of the base type.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class LocalType:
     ) -> list[VerifiedMatches]:
         matches = dict.fromkeys(images, _NO_MATCHES)
         verify = verification_of(self._options.verify_queries())
-        # limits the features in memory
+        # batches limit the features in memory
         for names in batched((image for image in images if image in self.first), BATCH):
             others = [self._map_features(self.first, name) for name in names]
             labels = [f"pair with {name}" for name in names]
@@ -151,8 +151,8 @@ class LocalType:
         """Match the best map images with the second matcher, and those with few matches by guided
         pyramid matching, if these are enabled.
 
-        Returns query keypoints with added ones last, matches in the order of ``pairs``, and the
-        reason if the pyramid was skipped, else "".
+        Return the query keypoints, followed by the added keypoints; the matches in the order of
+        ``pairs``; and the reason if the pyramid or some of its variants were skipped, else "".
         """
         options = self._options
         if self.second_matcher is not None:
@@ -203,9 +203,9 @@ class LocalType:
 
 
 def local_types_of(kapture_map: KaptureMap, options: PipelineOptions) -> list[LocalType]:
-    """Return the types for localization, in the options' order, then others by name.
+    """Return the keypoints types to match: those in the options, in order, then others by name.
 
-    Types in the options without map points only help to rank candidates.
+    Types without map points are matched only if the options name them, to rank candidates.
     """
     choices = options.local_features
     by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}
@@ -235,7 +235,7 @@ def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
 def extract_again(
     kapture_map: KaptureMap, keypoints: MapKeypoints, extractor: LocalFeatureExtractor
 ) -> dict[str, NDArray[Any]]:
-    """Extract descriptors of all stored map keypoints; zero for keypoints not detected again."""
+    """Extract descriptors of all stored map keypoints; zero if a keypoint is not detected again."""
     require(
         kapture_map.has_images(),
         f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "
@@ -269,9 +269,10 @@ def extract_again(
 
 @dataclass(frozen=True)
 class _GlobalType:
-    """Global features for comparison; ``choice`` is None if queries provide them.
+    """A type of global features to compare; ``choice`` is None if queries provide the vectors.
 
-    ``extractor`` is None for VLAD or missing weights; ``stored`` is true if the map has vectors.
+    ``extractor`` is None for VLAD, or if weights are missing. ``stored`` means that the map has the
+    vectors, and for VLAD the vocabulary.
     """
 
     name: str
@@ -292,8 +293,9 @@ class _GlobalType:
 class MapMatching:
     """Retrieval, matching and reranking of queries against a map; thread-safe.
 
-    Retrieval uses global features that map and query share; else types in the options that the map
-    has; else global features of the map images are computed in memory.
+    Retrieval uses the global features that both map and query have. Without any, it uses the types
+    in the options that are VLAD or stored in the map; without these, all types in the options.
+    Missing vectors of map images are computed in memory.
     """
 
     def __init__(
@@ -316,7 +318,8 @@ class MapMatching:
     def candidates(self, image: QueryImage, features: Sequence[Features]) -> tuple[list[str], bool]:
         """Return the map images to match, and whether they are ranked, best first.
 
-        The images of a small map without global features are all matched, unranked.
+        With exhaustive pairs, all permitted images are returned unranked; likewise in a small map
+        without vectors to rank them by.
         """
         query = image.query
         if query.candidates is not None:
@@ -390,7 +393,7 @@ class MapMatching:
         vectors = [self._of_query(kind, image, features) for kind in compared]
         rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
         members = np.array(sorted({self._positions[name] for name in permitted}), np.int64)
-        # do not copy the whole map, the usual pool
+        # usually the whole map is permitted; do not copy its vectors
         whole = len(members) == len(self._map.images)
         databases = [of_map if whole else of_map[members] for of_map in map(self._of_map, compared)]
         names, weights = zip(*((kind.name, kind.weight) for kind in compared), strict=True)
@@ -399,7 +402,7 @@ class MapMatching:
         return [self._map.images[i] for i in index[0] if i >= 0]
 
     def is_at_hand(self, brought: Collection[str]) -> bool:
-        """Return whether queries with these global features can be ranked immediately."""
+        """Return whether the map has vectors to compare with queries that have these types."""
         return all(kind.is_at_hand for kind in self._compared(brought))
 
     def describe_candidates(self, brought: Collection[str]) -> str:
@@ -434,7 +437,7 @@ class MapMatching:
             return _GlobalType(name, choice.weight, name in self._stored_vocabularies, choice)
         try:
             extractor = choice.make(self.options.placement)
-        except MissingWeightsError:  # raised again on use
+        except MissingWeightsError:  # raised again when the type is used
             stored = any(name.startswith(choice.name) for name in self._map.global_types())
             return _GlobalType(choice.name, choice.weight, stored, choice)
         stored = extractor.name in self._map.global_types()
@@ -548,7 +551,7 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 class LiveSource:
     """Matches of one camera, computed for the requested number of candidates.
 
-    Reranking, a second matcher and guided pyramids need the matches with all candidates first.
+    With reranking, a second matcher or guided pyramids, all candidates are matched at once.
     """
 
     def __init__(
@@ -574,7 +577,7 @@ class LiveSource:
         return view.among(self.candidates[:count])
 
     def _match(self, count: int) -> QueryView:
-        """Match those of the first ``count`` ranked images that are not matched yet."""
+        """Match the first ``count`` candidates unless already matched; return all matches."""
         self.clock.start()
         images, types = self._images[:count], self._matching.types
         num_matched = min(map(len, self._matches), default=0)

@@ -28,12 +28,12 @@ _ALONE = RigidTransform.identity()
 
 
 class Localizer:
-    """Estimates camera poses in a map of any tool, as ``megloc eval`` does with the same options.
+    """Estimates camera poses in a map of any tool, by the same steps as ``megloc eval``.
 
     Matches of all keypoints types form one pose problem. Query features are given, or extracted if
-    the map's type has an extractor plugin. Candidates are ranked by global features; small maps
-    use all images. Networks load on first use. ``options`` replaces preset, device (auto, cpu,
-    cuda, cuda:N) and precision (full, half).
+    an extractor plugin for the map's type is installed. Candidates are ranked by global features;
+    in small maps all images are candidates. Networks load on first use. ``options`` replaces
+    preset, device (auto, cpu, cuda, cuda:N) and precision (full, half).
 
     Examples
     --------
@@ -96,8 +96,8 @@ class Localizer:
     ) -> Iterator[Pose | Failure]:
         """Localize each query separately and lazily, in order.
 
-        ``executor`` holds threads, which share the map; ``candidates`` are map images by query
-        name, used instead of retrieval.
+        ``executor`` must be a thread pool, as the workers share the map. ``candidates`` are map
+        images by query name, which replace retrieval.
         """
         wrapped = (q if isinstance(q, Query) else _query_of(*q) for q in queries)
         units = (((query, _ALONE),) for query in wrapped)
@@ -111,9 +111,10 @@ class Localizer:
         *,
         candidates: Mapping[str, Sequence[str]] | None = None,
     ) -> Iterator[list[Pose | Failure]]:
-        """Localize images or rigs and yield one result per camera for each unit.
+        """Localize images or rigs (units), and yield one result per camera for each unit.
 
-        A rig without a pose is tried camera by camera. An undecodable image file fails its unit.
+        A rig without a joint pose is localized camera by camera. If an image file cannot be
+        decoded, all images of its unit fail.
         """
         if candidates is not None:
             known = candidates

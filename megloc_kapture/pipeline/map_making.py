@@ -1,8 +1,8 @@
 """Plans that make a map without queries, from posed images, photographs or COLMAP models.
 
-Photographs are matched, verified by a two-view model and reconstructed by COLMAP's mapper, then
-mapped again with known poses. COLMAP models are imported into the user's cache, and again if a
-file changes.
+Photographs are matched, verified by a two-view model and reconstructed by COLMAP's mapper; with
+these poses, the map is made as for posed images. COLMAP models are imported into the user's cache,
+and imported again if a file changes.
 """
 
 from __future__ import annotations
@@ -123,11 +123,11 @@ def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
 
 
 class ImportMapping(Stage):
-    """Import posed images, with coordinate frames from adjacent tables."""
+    """Import posed images, with coordinate frames from the side tables next to their folder."""
 
     name = "import"
     version = 3
-    writes = (MAPPING, QUERY, SIDE_TABLES)  # read by later stages, although the queries are empty
+    writes = (MAPPING, QUERY, SIDE_TABLES)  # later stages read QUERY, which stays missing
 
     def __init__(self, mapping: KaptureFolder) -> None:
         super().__init__(Options())
@@ -146,10 +146,10 @@ _BY_POSES = frozenset({"poses", "covisibility"})
 
 
 class ImportPhotographs(Stage):
-    """Import photographs into a workspace: cameras by EXIF, upright images, no poses."""
+    """Import photographs: upright images with cameras from EXIF (unless given), and no poses."""
 
     name = "import"
-    writes = (MAPPING, QUERY, SIDE_TABLES)  # read by later stages, although the queries are empty
+    writes = (MAPPING, QUERY, SIDE_TABLES)  # later stages read QUERY, which stays missing
 
     def __init__(self, photographs: Photographs) -> None:
         super().__init__(Options())
@@ -292,7 +292,7 @@ _VERSION = 3  # version of the import; a change rebuilds all maps
 
 
 def colmap_maps_folder() -> Path:
-    """Return the folder of imported maps, which may be missing and may be deleted."""
+    """Return the cache folder of imported maps; it may be missing, and users may delete it."""
     return user_cache() / "maps"
 
 
@@ -301,8 +301,9 @@ def import_colmap(
 ) -> dict[str, float]:
     """Write a COLMAP reconstruction as a kapture map into an empty folder and return counts.
 
-    The unit is unknown unless given. A model of poses alone becomes a kapture folder of poses; a
-    model with unavailable features is mapped again with its poses and the default preset.
+    The unit is unknown unless given. A model of poses alone becomes a kapture folder of poses. A
+    model without points, or whose keypoints are not found again in its images, is mapped again
+    with its poses and the default preset.
     """
     read = ColmapReconstruction.read(source)
     if unit != METRES:
@@ -325,7 +326,7 @@ def import_colmap(
         try:
             with workspace.lock(), single_threaded():
                 run_plan(stages, workspace, work)
-        except DataError as error:  # the workspace is deleted
+        except DataError as error:  # report the model, as the temporary workspace is deleted
             raise DataError(error.message, path=source.model) from error
         for made in workspace.path(MAP).iterdir():
             made.rename(output / made.name)

@@ -1,4 +1,4 @@
-"""Plan of stages in order, each run only if necessary."""
+"""Runs of stages in order; a stage runs only if necessary."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def map_of_workspace(path: Path) -> Path:
 
 
 class Workspace:
-    """Paths of a workspace (docs/architecture.md)."""
+    """Paths, lock and output folders of a workspace (docs/architecture.md)."""
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root, self.force = Path(root).absolute(), force
@@ -85,8 +85,8 @@ class Workspace:
     def lock(self) -> Iterator[None]:
         """Lock the workspace for this process.
 
-        Removes leftovers of killed runs, except finished items; at the end, removes a workspace
-        that has no stage.
+        First remove leftovers of killed runs, except items of stages that resume. At the end remove
+        the workspace if it has no output, not even unfinished.
         """
         path = self.root / LOCK
         with writing(path):
@@ -128,9 +128,10 @@ class Workspace:
 
     @contextmanager
     def staging(self, stage: str, mark: str, *, resumes: bool = False) -> Iterator[Path]:
-        """Yield the folder to write a stage's output into; removed on success.
+        """Yield the folder to write a stage's output into; remove it on success.
 
-        A stage that ``resumes`` gets the folder of an interrupted run with the same ``mark``.
+        A stage that ``resumes`` gets the folder of an interrupted run with the same ``mark``, its
+        fingerprint.
         """
         place = self.partial_path(stage)
         with writing(place):
@@ -150,7 +151,7 @@ class Workspace:
                     remove(place)
 
     def publish(self, staging: Path, outputs: tuple[str, ...]) -> None:
-        """Move a stage's outputs into place and remove old ones that were not written."""
+        """Move a stage's outputs into place, and remove old outputs that were not written again."""
         self._published = True
         for output in outputs:
             new, place = staging / output, self.root / output
@@ -192,7 +193,7 @@ def fingerprint(
 def output_fingerprint(
     stage: str, version: int, options: Mapping[str, Any], inputs: Mapping[str, str]
 ) -> str:
-    """Return a fingerprint that ignores the dataset's location and the protocol, for dependents."""
+    """Return the fingerprint for dependent stages; it ignores the dataset's path and protocol."""
     others = {name: value for name, value in options.items() if name != PROTOCOL}
     content = {name: mark for name, mark in inputs.items() if name != ROOT}
     return fingerprint(stage, version, others, content)
@@ -231,8 +232,9 @@ def run_plan(
 ) -> list[StageReport]:
     """Run the stages that are out of date, or report them in a ``dry_run``.
 
-    ``first`` and its dependents run again, earlier stages are kept; stages after ``last`` are
-    skipped. ``say`` receives a line when a stage starts, with the reason, and when it ends.
+    The stage ``first`` and its dependents run again, and stages before it are kept. Stages after
+    ``last`` do not run. ``say`` receives a line when a stage starts, with the reason, and a line
+    when it ends.
     """
     names = [stage.name for stage in stages]
     for name in (first, last):
@@ -248,11 +250,11 @@ def run_plan(
     for stage in stages:
         _check_root(stage, workspace)
     if not dry_run:
-        # first, so that an interrupted run does not forget the request
+        # before any stage runs, so that the next run still repeats these stages if this one stops
         for name in asked:
             workspace.manifest_path(name).unlink(missing_ok=True)
             remove(workspace.partial_path(name))
-    marks: dict[str, str] = {}  # output -> fingerprint
+    marks: dict[str, str] = {}  # stage -> fingerprint of its output
     reports = []
     for number, stage in enumerate(stages[:stop]):
         inputs = {name: marks[name] for name in _before(stages, stage)}
@@ -330,7 +332,7 @@ def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
 
 
 def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[str, str]:
-    """Return fingerprints of inputs from earlier runs that none of these stages writes."""
+    """Return, by stage, fingerprints of inputs from earlier runs that no planned stage writes."""
     written = [path for other in stages for path in other.writes]
     missing = [path for path in stage.reads if not any(is_below(path, other) for other in written)]
     if not missing:
@@ -347,7 +349,7 @@ def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[
 
 
 def _check_root(stage: Stage, workspace: Workspace) -> None:
-    """Refuse to replace results of another root, unless that root no longer exists."""
+    """Raise OptionError if the results are from another root that still exists."""
     made = workspace.manifest(stage.name)
     held = "" if made is None else made.inputs.get(ROOT, "")
     if workspace.force or not held or not Path(held).is_dir():

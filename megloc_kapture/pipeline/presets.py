@@ -43,7 +43,7 @@ OptionsT = TypeVar("OptionsT", bound=Options)
 # the paper as published; benchmarks/*.toml add its dataset-dependent steps (masks,
 # co-visibility, sequences, indoor weights), see docs/paper.md
 _MEGLOC = PipelineOptions(
-    # undistorted cameras are unchanged; enlarging: docs/experiments/preprocessing.md
+    # undistortion changes only distorted cameras; upscaling: docs/experiments/preprocessing.md
     preprocessing=PreprocessingOptions(max_size_px=1600, upscale=True, undistort=True),
     local_features=(
         LocalFeaturesChoice(name="superpoint", matching=PluginChoice(name="superglue")),
@@ -65,14 +65,14 @@ _MEGLOC = PipelineOptions(
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
 )
-# weights with a free licence: docs/experiments/presets.md
+# all weights have a free licence: docs/experiments/presets.md
 _MODERN = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(
         LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05}),
     ),
 )
-# weights available for download only, all with a free licence
+# all weights have a free licence, and must be downloaded
 _MODERN_LARGE = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(

@@ -35,12 +35,14 @@ class Query:
     Parameters
     ----------
     image : uint8 (H, W, 3) RGB or the path of an image file; optional if features are given.
-    features, global_features : by the map's type names; missing local features are extracted.
+    features, global_features : given features by type of the map; missing local features are
+        extracted.
     prior : map images that may be matched; None means all.
     candidates : map images to match, best first, instead of retrieval.
     mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may not exist.
     depth : depth map taken with the image, or a function that reads one; for ``icp``.
-    orientation : EXIF orientation to turn an image file upright, as the camera describes it.
+    orientation : EXIF orientation of an image file, which is turned upright when it is read;
+        ``camera`` describes the upright image.
     """
 
     camera: Camera
@@ -113,7 +115,7 @@ class Preprocessor:
         )
 
     def of(self, query: Query) -> QueryImage:
-        """Prepare a query lazily; images with local features stay as they are."""
+        """Prepare a query lazily; with given local features, neither resize nor undistort it."""
         frame = FrameOptions() if query.features else self._options.preprocessing
         return QueryImage(query, plan_frame(query.camera, frame), self)
 
@@ -156,7 +158,7 @@ class QueryImage:
 
     @cached_property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Combined mask bool (H, W), True = use; None means all."""
+        """Combined mask bool (H, W), True = use; None means no mask."""
         return self._frame.mask
 
     @property

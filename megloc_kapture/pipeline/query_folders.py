@@ -67,8 +67,8 @@ _LIST_SUFFIXES = (".txt", ".csv")
 class Queries(ABC):
     """Query images, read one at a time.
 
-    ``unreadable`` and ``faults`` give the reason, by image name, why an image or its features
-    are unusable; faults are filled during reading.
+    ``unreadable`` has, by image name, the reason why an image cannot be used; ``faults`` the reason
+    why its features cannot be used. ``faults`` is filled when queries are read.
     """
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class Queries(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Check everything that needs neither features nor pixels."""
+        """Check everything that can be checked without reading features or pixels."""
 
     def lacking(self, local_type: str) -> str | None:
         """Return the first image without features for a type, or None."""
@@ -89,7 +89,10 @@ class Queries(ABC):
         return []
 
     def units(self, *, rigs: bool) -> list[scene.Unit]:
-        """Return jointly localized (name, ``cam_from_rig``), by rig and timestamp or by image."""
+        """Return (name, ``cam_from_rig``) of the images that are localized jointly, by unit.
+
+        A unit has the images of a rig with one timestamp, or a single image.
+        """
         units = scene.query_units(self.data(), rigs=rigs)
         usable = (tuple(pair for pair in unit if pair[0] not in self.unreadable) for unit in units)
         return [unit for unit in usable if unit]
@@ -130,7 +133,7 @@ class _StoredType:
 
 
 class KaptureQueries(Queries):
-    """Queries of a kapture folder, with its features if it has any.
+    """Queries of a kapture folder, with the features in it if there are any.
 
     Cameras and keypoints are assumed to follow the map's conventions. The focal length of an
     uncalibrated camera comes from EXIF or a guess, and is estimated with the pose.
@@ -188,7 +191,7 @@ class KaptureQueries(Queries):
     def units(self, *, rigs: bool) -> list[scene.Unit]:
         units: list[scene.Unit] = []
         for unit in super().units(rigs=rigs):
-            if any(self._is_unknown(name) for name, _ in unit):  # no calibrated rig
+            if any(self._is_unknown(name) for name, _ in unit):  # a rig needs calibrated cameras
                 units += [((name, RigidTransform.identity()),) for name, _ in unit]
             else:
                 units.append(unit)
@@ -209,7 +212,7 @@ class KaptureQueries(Queries):
         width, height = map(int, self._sensor(name).params[1:])
         try:
             camera = read_photo(self._folder.image_path(name)).camera
-        except DataError:  # the features are enough
+        except DataError:  # the query can be localized from its features
             return guessed_camera(width, height)
         # keypoints are in pixels of the sensor's image size
         is_other = min(width, height) > 0 and (width, height) != (camera.width, camera.height)
@@ -305,18 +308,19 @@ class _Image:
 class Photographs(Queries):
     """Photographs and videos, as queries or as input of a map.
 
-    Without a given camera, images are turned upright by their EXIF orientation and the camera
-    describes the turned image; the focal length comes from EXIF or a guess and is always
-    estimated with the pose. A given camera describes the stored pixels and is scaled uniformly to
-    images of another size. Images of the same size, make and focal length share a camera.
+    Without a given camera, images are turned upright by their EXIF orientation, and the camera
+    describes the upright image. Its focal length comes from EXIF or a guess, and is always
+    estimated with the pose. A given camera describes the stored pixels, and is scaled uniformly to
+    images of another size. Photographs of the same make, model, size and focal length share a
+    camera, as do the frames of a video.
 
     Parameters
     ----------
-    paths : files and folders, searched through links for images and videos; hidden files, nested
-        kapture folders and megloc outputs are skipped. Names are paths below the given folder, or
-        file names; frames are ``walk.mp4/000120.jpg``. A given kapture folder contributes its
-        images and calibrated cameras.
-    camera : camera of all images, or a list of cameras by image; replaces EXIF.
+    paths : image and video files, and folders, which are searched recursively, also through links;
+        hidden files, nested kapture folders and megloc outputs are skipped. The name of an image is
+        its path below the given folder, or its file name; a frame is ``walk.mp4/000120.jpg``. A
+        given kapture folder contributes its images and calibrated cameras.
+    camera : camera of all images, or a list of cameras by image; replaces the camera from EXIF.
     every : take every n-th frame of a video; 30 by default.
     """
 
@@ -351,7 +355,7 @@ class Photographs(Queries):
         warn_of_scaled(roots[0], self._scaled)
         if self.names and self.without_row == self.names:
             raise OptionError(
-                f"the list of cameras has none of the images, for example {self.names[0]}: the "
+                f"the list of cameras names none of the images, for example {self.names[0]}: the "
                 "first field of each row is an image name"
             )
 
@@ -367,7 +371,7 @@ class Photographs(Queries):
         return lines
 
     def check(self) -> None:
-        """Do nothing: everything else needs pixels."""
+        """Do nothing: the constructor has made all checks that need no pixels."""
 
     def query(self, name: str) -> Query:
         image = self._images[name]
@@ -384,7 +388,7 @@ class Photographs(Queries):
         sensor_ids: dict[tuple[str, Camera], str] = {}
         for timestamp, name in enumerate(self.names):
             image = self._images[name]
-            # frames of a video share a camera, and photographs without EXIF may
+            # frames of a video share a camera; so do photographs of one size without EXIF
             made_by = name.rpartition("/")[0] if image.is_frame else image.make
             sensor_id = sensor_ids.setdefault((made_by, image.camera), f"camera{len(sensor_ids)}")
             title = made_by.replace(",", " ")
@@ -498,7 +502,7 @@ def _images_below(folder: Path) -> list[Path]:
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
         written = (here / MARKER).is_file() or (here / "sensors" / "sensors.txt").is_file()
-        if real in seen or (written and here != folder):  # link loop or megloc output
+        if real in seen or (written and here != folder):  # link loop, or kapture or megloc output
             folders.clear()
             continue
         seen.add(real)

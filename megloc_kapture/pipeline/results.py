@@ -30,11 +30,11 @@ Candidates = Mapping[str, Sequence[str]]
 
 
 class Results(Mapping[str, Pose | Failure]):
-    """Mapping from image name to result, in the order of names (rigs: of timestamps).
+    """Mapping from image name to result, sorted by name; images of a rig may stay together.
 
-    Access localizes an image and those before it; photographs share cameras and are localized all
-    at once. Results are kept, with failures for unusable images. ``candidates`` are map images by
-    query name, used instead of retrieval.
+    Access to an image localizes it and all images before it. Photographs share cameras, so the
+    first access localizes all of them. Results are cached; an unusable image gives a Failure.
+    ``candidates`` are map images by query name, which replace retrieval.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Results(Mapping[str, Pose | Failure]):
         return dict, (list(self.items()),)
 
     def save(self, output: Path | str, *, force: bool = False) -> dict[str, int]:
-        """Write a kapture folder with ``status.csv`` and fallbacks for failures; return counts."""
+        """Write a kapture folder with ``status.csv`` and, if enabled, fallbacks; return counts."""
         with staged_output(Path(output), kind=LOCALIZED, force=force) as out:
             return self.write_to(out)
 
@@ -104,7 +104,7 @@ class Results(Mapping[str, Pose | Failure]):
         return counts
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return one row per image: ``status.csv`` and ``cam_from_world``, NaN without a pose."""
+        """Return one row per image: columns of ``status.csv``, and pose columns (NaN if failed)."""
         import pandas as pd
 
         rows = []

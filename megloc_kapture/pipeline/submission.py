@@ -60,7 +60,7 @@ _Results = Mapping[str, LocalizationResult]
 
 
 def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
-    """Raise an error if an official dataset's rules differ from those of the side tables."""
+    """Raise OptionError if the side tables are of another dataset, or if required but missing."""
     check_known(dataset)
     plain = (KAPTURE, SYNTHETIC)
     wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
@@ -95,13 +95,14 @@ def write_submission(
     place : the file; for MLAD a folder with one file per relocalization file.
     tables : the workspace's ``megloc/`` folder; without it, all queries count, in the map frame.
     provenance : entries for the provenance (dataset, preset, options).
-    from_rig : derive missing poses from the rig.
+    from_rig : derive missing and fallback poses from other cameras of the rig.
 
     Returns
     -------
-    Counts: ``queries``; ``scored`` images (MLAD: rows), split into ``poses`` and ``missing``;
-    missing due to low confidence (``doubtful``); poses guessed by retrieval (``fallbacks``) or
-    derived ``from_rig``; and MLAD rows with a placeholder pose (``dummies``).
+    Counts by name: ``queries``; ``scored``, the scored images (MLAD: rows); ``poses`` and
+    ``missing``, scored with and without a pose; ``doubtful``, missing because of low confidence;
+    ``fallbacks``, poses of the best candidate; ``from_rig``, poses derived from the rig;
+    ``dummies``, MLAD rows with an identity pose.
     """
     beside = None if tables is None else tables.parent
     rules = Protocol() if tables is None else read_protocol(tables)
@@ -146,7 +147,7 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
     data = localized_data
     query = None if beside is None else beside / QUERY
     if query is not None and (query / "sensors" / "sensors.txt").is_file():
-        # has the rig, and queries that the result of another program may lack
+        # the imported queries have the rig, and all images; a third-party result may lack images
         data = KaptureFolder(query).read()
         strange = set(localized_data.image_names()) - set(data.image_names())
         if strange:
@@ -213,7 +214,10 @@ def _ltvl(
 
 
 def _mlad(results: _Results, tables: Path) -> _Content:
-    """Return texts by file name, the query of each row with a pose, and rows without one."""
+    """Return texts by file name, the query of each row with a pose, and the rows without a pose.
+
+    A row without a pose is given by its description and its query.
+    """
     pairs = read_relocalization(tables)
     require(
         pairs,
@@ -245,7 +249,7 @@ def _dataset_fingerprint(workspace: Path | None) -> str | None:
 
 
 def workspace_provenance(localized: Path) -> dict[str, Any]:
-    """Return preset and options of a result from its workspace's manifests; empty if stale."""
+    """Return fingerprint, preset and options of a result, as far as manifests are up to date."""
     manifests = _manifests(localized)
     made = _maker(localized, manifests)
     if made is None:

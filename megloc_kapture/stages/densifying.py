@@ -80,7 +80,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class LiftedPoints:
-    """World points (N, 3), covariances (N, 6) and keypoint ids (N,)."""
+    """World points (N, 3) from keypoints and depth, covariances (N, 6), and keypoint ids (N,)."""
 
     xyz: Floats
     covariances: Floats
@@ -99,7 +99,7 @@ def depth_path(image: str) -> str:
 
 
 def side_file(root: Path, image: str, kind: Literal["sigma", "normals"]) -> Path:
-    """Return the path of a side file in the kapture at ``root``; see the module."""
+    """Return the path of a file outside the kapture format; see the module's docstring."""
     return safe_join(root / "sensors" / FOLDER, f"{image}.{kind}.npy")
 
 
@@ -115,7 +115,7 @@ def read_beside(
 
 
 def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: int) -> KaptureData:
-    """Add a depth sensor on a common rig to each camera whose images have depth."""
+    """Add a depth sensor to each camera whose images have depth; both are on one rig."""
     extended = replace(
         data,
         sensors=dict(data.sensors),
@@ -150,7 +150,7 @@ def link_images_and_masks(source: KaptureFolder, output: Path) -> None:
 def write_points(
     source: KaptureFolder, output: Path, lifted: Mapping[str, Mapping[str, LiftedPoints]]
 ) -> int:
-    """Write a map's points, followed by the lifted ones; return the number of lifted points.
+    """Write a map's points, followed by the lifted points; return the number of lifted points.
 
     ``lifted`` is keyed by keypoints type and image.
     """
@@ -195,7 +195,7 @@ def fuse_depth(
 ) -> int:
     """Write a PLY cloud with normals and deviations; return the number of points.
 
-    A pixel is skipped if an earlier source of its image, by name, has the same surface.
+    A pixel is skipped if the depth map of a source image with an earlier name agrees with it.
     """
     path = densified.root / DEPTH_FILE
     require(path.is_file(), "no densified map: reconstruction/depth.csv is missing", path=path)
@@ -246,14 +246,17 @@ def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDA
 
 _NO_POINTS = np.zeros(0, np.int64)
 _ANCHOR_VIEWS = 2  # views that must agree with a keypoint's depth before it is lifted
-# keypoint noise in image pixels under exact poses; excess is attributed to the poses
+# median reprojection error with exact poses, in image pixels; more is attributed to the poses
 _KEYPOINT_ERROR_PX = 0.3
-# target median pose error in depth-map pixels; tolerated difference of views, in multiples of
-# it; deviation between two noisy views per median planar distance, after the points of three
-# views have absorbed half of the variance
-_ERROR_PX, _DIFFERENCE, _DEVIATION = 0.5, 5.0, 2 / 1.1774
+# largest median pose error in pixels of a depth map, and tolerated difference between views in
+# multiples of the pose error
+_ERROR_PX, _DIFFERENCE = 0.5, 5.0
+# standard deviation between two views per median error: the median distance in a plane is 1.1774
+# standard deviations; two views differ by sqrt(2); and points triangulated from three views have
+# absorbed half of the variance, another sqrt(2)
+_DEVIATION = 2 / 1.1774
 
-# number of source images of an image; more where poses are not exact
+# number of source images per image, and largest number if the poses are not exact
 _NUM_SOURCES, _MAX_SOURCES = 4, 16
 
 
@@ -262,8 +265,8 @@ class DensifyOptions(Options):
 
     mode: Literal["off", "depth", "points"] = Field(
         default="off",
-        description="depth: estimate depth of map images without it; points: also lift keypoints "
-        "without a point",
+        description="depth: estimate depth of map images without depth; points: also make map "
+        "points from keypoints without a point",
     )
     estimator: PluginChoice = Field(
         default=PluginChoice(name="sweep"), description="sweep, colmap or a plugin"
@@ -282,8 +285,8 @@ class StereoFit:
     Attributes
     ----------
     max_size_px : longer side of the depth maps.
-    num_sources : map images that an image is compared with.
-    error_px : error of the poses in pixels of the depth maps; 0 if unknown.
+    num_sources : number of map images that an image is compared with.
+    error_px : median error of the poses in pixels of the depth maps; 0 if unknown.
     """
 
     max_size_px: int
@@ -374,10 +377,11 @@ def _check(source: KaptureFolder, data: KaptureData) -> None:
 
 
 def fitted_to_poses(source: KaptureFolder, max_size_px: int) -> StereoFit:
-    """Fit stereo to the pose error: the median reprojection error beyond keypoint noise.
+    """Fit stereo to the pose error: the median reprojection error in excess of keypoint noise.
 
-    Images are reduced until it is at most half a pixel, as no view could confirm finer detail, and
-    compared with proportionally more sources. Views may differ by five times the error.
+    Images are reduced until the pose error is at most half a pixel, as other views could not
+    confirm finer detail. A reduced image is compared with proportionally more sources. Two views
+    agree up to five times the pose error, or up to the default tolerance if that is larger.
     """
     indices = [index_map(source, local_type) for local_type in source.observations()]
     angles = [with_noise(source, index).noise_rad for index in indices]
@@ -473,7 +477,7 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
 
 
 def _estimate(job: _Job) -> str:
-    """Estimate one image's depth into the scratch folder; return "" or why it failed."""
+    """Estimate one image's depth into the scratch folder; return the reason of a failure, or ""."""
     folder, size = job.folder.open(), job.fit.max_size_px
     try:
         views = [_view(folder, image, size) for image in (job.image, *job.sources)]
@@ -491,7 +495,7 @@ def _estimate(job: _Job) -> str:
 
 
 def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
-    """Write the depth that the sources confirm; return its share and the lifted points."""
+    """Write the depth that sources confirm; return its proportion of pixels, and lifted points."""
     folder, size = job.folder.open(), job.fit.max_size_px
     view = _view(folder, job.image, size)
     names = ("depth", "sigma", "normals")

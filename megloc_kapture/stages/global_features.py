@@ -150,7 +150,7 @@ def write_vocabulary(
 
 
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
-    """Read the vocabulary of a global feature type, or None."""
+    """Read the vocabulary and the settings of a VLAD type; None if they are missing."""
     if not (folder / SETTINGS_FILE).is_file():
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
@@ -166,7 +166,7 @@ VLAD = "vlad"
 
 class VladChoiceOptions(VladOptions):
     local_type: str | None = Field(
-        default=None, description="local features to aggregate; none: the first of the run"
+        default=None, description="type of local features to aggregate; none: the run's first type"
     )
 
     def of_vlad(self) -> VladOptions:
@@ -188,7 +188,7 @@ class GlobalFeaturesChoice(PluginChoice):
             return VladChoiceOptions(**self.options)
         except ValidationError as error:
             fault = option_fault(error, VladChoiceOptions)
-            raise OptionError(f"global features {VLAD!r} refuse their options: {fault}") from error
+            raise OptionError(f"global features {VLAD!r} reject their options: {fault}") from error
 
     def make(self, placement: Placement = AUTO) -> GlobalFeatureExtractor:
         known = plugin_names(PLUGINS)
@@ -242,7 +242,10 @@ def extract_global_features(
 def describe_images(
     extractor: GlobalFeatureExtractor, images: Sequence[NDArray[np.uint8]], names: Sequence[str]
 ) -> NDArray[np.float32]:
-    """Compute unit vectors, float32 (B, D), of RGB images of one size, at most 8 megapixels."""
+    """Compute unit vectors, float32 (B, D), of RGB images of one size.
+
+    Images with more than 8 megapixels are reduced first.
+    """
     many: Any = extractor
 
     def describe(batch: Sequence[NDArray[np.uint8]]) -> list[Any]:

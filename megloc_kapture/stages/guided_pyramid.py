@@ -1,12 +1,12 @@
 """Repeated matching of pairs by a second matcher, then by guided pyramids (MegLoc).
 
-The second matcher matches the best pairs of each image; guided pyramids match poor pairs at other
-scales and rotations.
+The second matcher matches the best pairs of each image; guided pyramids match pairs with few
+matches at other scales and rotations.
 
-The result is a keypoints type ``T-pyramid``: the keypoints of T, unchanged, followed by the added
-ones, with the matches of all pairs. Indices into T are therefore valid in T-pyramid. All variants
-are matched before pairs are combined, so that the order of the added keypoints does not depend on
-the workers.
+Guided pyramids give a keypoints type ``T-pyramid`` with the matches of all pairs: the keypoints of
+type T, unchanged, followed by the added keypoints. Indices into T are therefore valid in T-pyramid.
+All variants of all pairs are matched before the matches of a pair are combined, so that the order
+of the added keypoints does not depend on the workers.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ class PyramidFeatures:
         self._left = [image for image in sorted(folder.read().image_names()) if image in keypoints]
         for image in self._left:
             check_lengths(keypoints, descriptors, image)
-        # the files keep the method's name, which identifies the extractor
+        # the configurations keep their ``name``, which identifies the extractor
         configs = keypoints.config, replace(descriptors.config, keypoints_type=name)
         self._kinds = [
             (
@@ -219,8 +219,8 @@ class PyramidFeatures:
 class RetriedQuery:
     """A query after guided pyramid matching.
 
-    Added keypoints (A, C) and descriptors (A, D) follow the query's; matches are in order of the
-    candidates.
+    The added keypoints (A, C) and descriptors (A, D) follow those of the query. ``matches`` are in
+    the order of the candidates.
     """
 
     added_px: NDArray[np.float32]
@@ -245,7 +245,7 @@ def retry_query(
     ----------
     matches : name, verified matches (K, 2) and scores (K,) of each candidate, best first.
     frame : reads pixels and mask of the query; called only if a candidate has few matches.
-    num_found : matches of each candidate before verification; by default as in ``matches``.
+    num_found : number of matches before verification by candidate; default: after verification.
     """
     base = {other: pairs for other, pairs, _ in matches}
     num_of = num_found or {}
@@ -320,7 +320,7 @@ def pyramid_mapping(
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
         others[a][0].append(b)
-        # rotating either image is equivalent, so b only gets scaled
+        # rotating a is equivalent to rotating b, so b is only scaled
         others[b][1].append(a)
 
     features = PyramidFeatures(output, mapping, local_type)
@@ -412,8 +412,8 @@ def pyramid_queries(
 ) -> dict[str, float]:
     """Match query pairs with few matches again: variants of the query with the map's keypoints.
 
-    The map stays unchanged; its keypoints of ``T-pyramid`` are used if it has any. See
-    :func:`pyramid_mapping`.
+    The map stays unchanged; its type ``T-pyramid`` is matched if it has that type. Output and
+    ``num_found`` are as in :func:`pyramid_mapping`.
     """
     before = num_found or {}
     larger = pyramid_type(local_type)
@@ -470,7 +470,7 @@ def _retry(
 
 
 class _AgainStage(PipelineStage):
-    """Match the best pairs again with a second matcher, and poor pairs in guided pyramids."""
+    """Match the best pairs again by a second matcher, then pairs with few matches by pyramids."""
 
     version = 4
     matches: ClassVar[str]
@@ -536,12 +536,12 @@ def _match_counts(features_dir: Path, local_type: str) -> dict[_Pair, PairCount]
 
 
 def _named(pairs: Sequence[ImagePair]) -> set[_Pair]:
-    """Return the names of the pairs in both orders, as map pairs are stored in one."""
+    """Return the names of the pairs in both orders; within a map, only one order is stored."""
     return {names for p in pairs for names in ((p.query, p.map), (p.map, p.query))}
 
 
 class PyramidMapping(_AgainStage):
-    """Match pairs of map images again: with a second matcher, at other scales and rotations."""
+    """Match pairs of map images again: by a second matcher, and at other scales and rotations."""
 
     name = "mapping_pyramid"
     matches = MAPPING_MATCHES

@@ -67,8 +67,8 @@ from megloc_kapture.values import Options
 class Restrictions:
     """Priors of the queries, and the coordinate frames of the map images.
 
-    ``groups`` has each image's group. ``priors`` has the permitted map images, locations or frames
-    of each query; others are unrestricted.
+    ``groups`` maps a map image to its group. ``priors`` maps a query to the permitted map images,
+    locations or frames; a query without an entry is unrestricted.
     """
 
     groups: Mapping[str, ImageGroup] = field(default_factory=dict)
@@ -85,7 +85,7 @@ class Restrictions:
         return "" if group is None else group.frame
 
     def frames(self, images: Sequence[str]) -> list[NDArray[np.int64]]:
-        """Return indices into ``images`` by frame, frames sorted by name."""
+        """Return the indices into ``images`` of each frame; frames are sorted by name."""
         members: dict[str, list[int]] = {}
         for position, image in enumerate(images):
             members.setdefault(self.frame(image), []).append(position)
@@ -94,7 +94,7 @@ class Restrictions:
     def pools(
         self, queries: Sequence[str], images: Sequence[str]
     ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
-        """Group queries by permitted images.
+        """Group queries by their permitted map images.
 
         Yield indices into ``queries`` and sorted indices into ``images``, int64 (M,); M may be 0.
         """
@@ -123,19 +123,21 @@ UNRESTRICTED = Restrictions()
 
 
 Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
-_QUERY_ELEMENTS = 1 << 27  # query vector elements in memory: 512 MiB of float32
+_QUERY_ELEMENTS = 1 << 27  # elements of query vectors in memory at once: 512 MiB of float32
 
 
 class QueryPairsOptions(Options):
     by: Literal["retrieval", "exhaustive"] = Field(
-        default="retrieval", description="the most similar map images, or all"
+        default="retrieval",
+        description="candidates of a query; retrieval: the most similar map images; exhaustive: "
+        "all map images",
     )
     top_k: int = Field(default=50, gt=0, description="number of most similar map images per query")
 
 
 @dataclass(frozen=True)
 class Retrieval:
-    """Global features, by kapture type name, and their fusion weights; equal if empty."""
+    """Kapture types of global features, and their fusion weights; without weights all are equal."""
 
     types: tuple[str, ...]
     weights: tuple[float, ...] = ()
@@ -150,9 +152,10 @@ class Retrieval:
         database: Sequence[Vectors],
         top_k: int,
     ) -> Found:
-        """Find the most similar database rows: indices and scores (Q, at most ``top_k``).
+        """Return indices and scores, (Q, at most ``top_k``), of the most similar database rows.
 
-        ``queries`` and ``database`` hold unit rows by type, read in parts.
+        ``queries`` and ``database`` have the unit vectors of each type as rows; they are read in
+        blocks.
         """
         search = FusedSearch(top_k, self.fusion, self.weights or None)
         asked = [as_blocks(source) for source in queries]
@@ -167,7 +170,7 @@ class Retrieval:
 
 
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
-    """Return lazily read unit vectors of the images by type."""
+    """Return the unit vectors of the images by type; they are read lazily."""
     for reader in readers:
         missing = [image for image in images if image not in reader]
         if missing:
@@ -185,12 +188,13 @@ def most_similar(
     retrieval: Retrieval,
     top_k: int,
 ) -> Found:
-    """Return indices of the most similar images, best first, and scores: (Q, K), -1 for none.
+    """Return the most similar images of each query, best first, and their scores, both (Q, K).
 
     Parameters
     ----------
     queries, database : unit vectors (Q, D) and (M, D) by type.
-    permitted : indices (M,) of the database's images.
+    permitted : indices (M,) of the database's images; the result has these indices, or -1 for
+        missing images.
     """
     index, scores = retrieval.rank(queries, database, top_k)
     return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
@@ -201,7 +205,9 @@ PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhau
 
 class MappingPairsOptions(Options):
     by: tuple[PairingMethod, ...] = Field(
-        default=("retrieval",), min_length=1, description="methods, whose pairs are united"
+        default=("retrieval",),
+        min_length=1,
+        description="pairing methods; a pair is matched if one of them chooses it",
     )
     top_k: int = Field(
         default=20, gt=0, description="number of most similar images per image (retrieval)"
@@ -217,7 +223,7 @@ class MappingPairsOptions(Options):
 def _seen_points(
     folder: KaptureFolder, images: Sequence[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the point ids and image rows (O,) of the observations."""
+    """Return the point ids and the rows of ``images``, (O,) each, of the observations."""
     check_points(folder, "pair images by co-visibility")
     row_of = {image: row for row, image in enumerate(images)}
     points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
@@ -239,11 +245,11 @@ def pair_map_images(
     restrictions: Restrictions = UNRESTRICTED,
     covisible: KaptureFolder | None = None,
 ) -> list[ImagePair]:
-    """Choose sorted pairs of posed map images within coordinate frames, first name before second.
+    """Pair the posed map images of each coordinate frame; return sorted pairs of sorted names.
 
-    If no image has a pose, pair all images by methods that need no poses. The score is the cosine
-    similarity for pairs found by retrieval, else 1. ``covisible`` is a map of the same images whose
-    points are used for co-visibility, by default ``mapping``.
+    If no image has a pose, all images are paired, by methods other than ``poses``. The score of a
+    pair is its (fused) similarity if retrieval chose it, else 1. ``covisible`` is a map of the same
+    images whose points are used for co-visibility, by default ``mapping``.
     """
     data = mapping.read()
     poses = data.poses()
@@ -283,7 +289,7 @@ def pair_map_images(
 def _united(
     images: Sequence[str], pairs: NDArray[np.int64], similarities: NDArray[np.float64]
 ) -> list[ImagePair]:
-    """Return each pair once with its best similarity; 1 for -inf."""
+    """Return each pair once with its best similarity, or 1 if that is -inf (unknown)."""
     keys, rows = np.unique(pairs[:, 0] * len(images) + pairs[:, 1], return_inverse=True)
     scores = np.full(len(keys), -np.inf)
     np.maximum.at(scores, rows, similarities)
@@ -298,7 +304,7 @@ def _united(
 def _most_similar(
     vectors: Sequence[KaptureVectors], retrieval: Retrieval, top_k: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return pairs (P, 2), i < j, of each row and its ``top_k`` neighbours, and similarities."""
+    """Return the pairs (P, 2), i < j, of rows and their ``top_k`` neighbours, with similarities."""
     index, similarity = retrieval.rank(vectors, vectors, top_k + 1)
     rows = np.repeat(np.arange(len(index)), index.shape[1])
     both = np.stack([rows, index.ravel()], axis=1)
@@ -404,25 +410,26 @@ Matched = int | NDArray[np.int64]
 class RerankingOptions(Options):
     by: Literal["none", "matches", "verified", "coverage"] = Field(
         default="none",
-        description="score of a candidate; matches: number of matches; verified: number that "
-        "two-view geometry accepts; coverage: number of these at keypoints that "
-        "better candidates do not match",
+        description="score of a candidate; matches: number of matches; verified: number of "
+        "verified matches; coverage: number of verified matches at query keypoints that better "
+        "candidates do not match",
     )
     local_type: str | None = Field(
         default=None,
-        description="type of local features to count, by name or plugin; none: all types together",
+        description="local features whose matches count, by type or plugin; none: all types "
+        "together",
     )
-    keep: int = Field(default=20, gt=0, description="number of candidates kept, N")
+    keep: int = Field(default=20, gt=0, description="number of candidates to keep, the paper's N")
 
     def reranks(self) -> bool:
         return self.by != "none"
 
     def types_named(self, local_types: Sequence[str]) -> list[str]:
-        """Return the types selected by ``local_type``; all if it names none."""
+        """Return the types that ``local_type`` selects; all if it is None or nothing is ranked."""
         name = self.local_type
         if name is None or not self.reranks():
             return list(local_types)
-        # a type may carry the name of its weights after the plugin's name
+        # in a type's name, the name of the weights may follow that of the plugin
         types = [local_type for local_type in local_types if base_type(local_type) == name]
         return types or [local_type for local_type in local_types if local_type.startswith(name)]
 
@@ -441,8 +448,8 @@ def rerank(
 ) -> tuple[list[int], list[int]]:
     """Rank the candidates of one query by matches; return kept positions and their counts.
 
-    Ties keep the retrieval order. ``of_types`` has the number of matches, or matched keypoint rows
-    (K,), by type and candidate.
+    Ties keep the retrieval order. ``of_types`` has, by type and candidate, the number of matches,
+    or for ``coverage`` the matched keypoint rows (K,).
     """
     num = len(of_types[0]) if of_types else 0
     if options.by == "coverage":
@@ -481,7 +488,10 @@ def reranked(
     local_types: Sequence[str],
     options: RerankingOptions,
 ) -> list[ImagePair]:
-    """Rerank candidates by stored matches; the score is the count plus a tie-breaking fraction."""
+    """Rerank candidates by stored matches.
+
+    The score of a pair is its count plus a fraction that keeps the order of equal counts.
+    """
     if not options.reranks():
         return list(pairs)
     counted_types = options.counted_types(local_types)

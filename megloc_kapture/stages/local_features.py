@@ -54,7 +54,7 @@ def extract_local_features(
     mask_margin_px: float = 0.0,
     work: Work = HERE,
 ) -> dict[str, int]:
-    """Extract features of all images (orphan layout), without masked keypoints."""
+    """Write features of all images (orphan layout) without masked keypoints; return counts."""
     spec_of, jobs = cache(FolderSpec), []
     for image, folder in images_of(folders, "extract features from").items():
         camera, has_mask = folder.read().camera_of(image), mask_path(folder, image).is_file()
@@ -179,7 +179,7 @@ def read_mask(
 def extract_all(
     extractor: LocalFeatureExtractor, frames: Sequence[Frame], names: Sequence[str]
 ) -> list[LocalFeatures]:
-    """Extract features from images of one size; very large ones are reduced for extraction."""
+    """Extract features from images of one size; very large images are reduced for extraction."""
     features = in_batches(
         extractor,
         "extract_many",

@@ -1,6 +1,7 @@
-"""Features of map images: copies into new maps, and points of a model without features.
+"""Features of map images: copies for new maps, and extracted features for models without them.
 
-Points of such a model are moved to extracted keypoints at the same positions.
+A model without descriptors, for example of COLMAP, stores only keypoint positions. Its observations
+are transferred to extracted keypoints at the same positions.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 
 # detector implementations differ by some tenths of a pixel
 _MAX_SHIFT_PX = 1.0
+# smallest proportion of observations with an extracted keypoint at their position
 _MIN_FOUND_AGAIN = 0.5
-# identical keypoints only differ by rounding
+# keypoints with equal positions and different orientations; positions differ only by rounding
 _SAME_PLACE_PX = 0.1
 
 
@@ -39,7 +41,7 @@ def move_points(
 ) -> dict[str, float]:
     """Write a model as a map with the features of ``mapping``; return counts for the log.
 
-    Only keypoints that see points are kept; points without observations are dropped.
+    Only keypoints that observe a point are kept; points without observations are dropped.
     """
     seen = model.observations()[local_type]
     moved, rows_of, num_found = _moved(model, mapping, seen)
@@ -75,7 +77,8 @@ def _moved(
 ) -> tuple[Observations, dict[str, NDArray[np.int64]], int]:
     """Transfer observations to all extracted keypoints at the same position (one per orientation).
 
-    Return observations that index the kept rows, these rows by image, and the transferred number.
+    Return the new observations, the rows of the kept keypoints by image, and the number of stored
+    observations that were transferred. The new keypoint ids are positions among the kept rows.
     """
     local_type = seen.keypoints_type
     stored, extracted = reference.keypoints(local_type), mapping.keypoints(local_type)
@@ -89,7 +92,7 @@ def _moved(
             continue
         places = stored.read(image)[seen.keypoint_ids[rows], :2]
         of, keypoints = rows_at_their_places(places, extracted.read(image)[:, :2], _MAX_SHIFT_PX)
-        # stored keypoints at one position that see one point are duplicates
+        # stored keypoints that observe one point at one position are duplicates
         pairs = np.unique(np.stack([seen.point_ids[rows[of]], keypoints], axis=1), axis=0)
         num_found += len(np.unique(of))
         rows_of[image], numbers = np.unique(pairs[:, 1], return_inverse=True)
@@ -112,8 +115,8 @@ def rows_found_again(
 ) -> NDArray[np.int64]:
     """Return the row of ``extracted`` (M, 2) for each row of ``stored`` (N, 2), or -1.
 
-    Each extracted row is used once. Keypoints at one position with different orientations are
-    assigned in order.
+    Each extracted row is used at most once. Keypoints that have equal positions and different
+    orientations are assigned in order.
     """
     rows, used = np.full(len(stored), -1, dtype=np.int64), set[int]()
     of, again = rows_at_their_places(stored, extracted, _MAX_SHIFT_PX)
@@ -129,8 +132,9 @@ def rows_at_their_places(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return all pairs of stored (N, 2) and extracted (M, 2) keypoints at the same position.
 
-    The position of a stored keypoint is that of the nearest extracted one within ``max_shift_px``.
-    Return rows of both, int64 (K,) each, sorted by the first, then the second.
+    A stored keypoint is paired with its nearest extracted keypoint, if that is within
+    ``max_shift_px``, and with all extracted keypoints at the position of the nearest. Return stored
+    and extracted rows, int64 (K,) each, sorted by stored row, then extracted row.
     """
     none = np.zeros(0, dtype=np.int64)
     if len(stored) == 0 or len(extracted) == 0:
@@ -162,8 +166,8 @@ def copy_features(
 ) -> None:
     """Add features of the map images to the kapture at ``output``.
 
-    Files are hard links where possible. The source's internal features are user data and copied,
-    unless ``link_own``. ``local_types`` does not restrict global features.
+    Files are hard-linked where possible. Features inside the source folder are user data and are
+    copied, unless ``link_own`` is set. ``local_types`` does not restrict global features.
     """
     wanted = None if local_types is None else set(local_types)
     for kind in _READ:

@@ -1,4 +1,4 @@
-"""Stages: map points, triangulated or lifted through depth."""
+"""Stage: map points, triangulated from matches, or lifted (backprojected with depth maps)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def triangulate_map(
 ) -> dict[str, float]:
     """Triangulate with fixed poses and intrinsics, write the map, and return counts for the log.
 
-    Each feature type has separate points, those of the first type first.
+    Each keypoints type has separate points; those of the first type come first.
 
     Parameters
     ----------
@@ -115,7 +115,10 @@ def matches_of(
 def matched_pairs(
     reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None
 ) -> NDArray[np.int64]:
-    """Return matched pairs (P, 2) of rows of ``images``, among ``asked`` (first name first)."""
+    """Return the pairs with matches, as rows of ``images`` (P, 2).
+
+    ``asked`` restricts them to these pairs of names, sorted within a pair; None means all.
+    """
     row_of = {image: row for row, image in enumerate(images)}
     pairs = [
         (row_of[a], row_of[b])
@@ -155,7 +158,7 @@ def lift_map(
     *,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Lift keypoints through the depth maps and write the map; return counts for the log."""
+    """Backproject keypoints with depth maps and write the map; return counts for the log."""
     data = mapping.read()
     poses = data.poses()
     records = depth_records(data)
@@ -219,7 +222,7 @@ def _write_map(
 ) -> None:
     write_sensors(output, mapping.read())
     link_images(mapping.root, output)
-    # keep a pyramid's base type, as queries are first matched with that
+    # also copy the base type of a pyramid type, as queries are first matched with the base type
     copy_features(mapping, output, {*observations, *map(base_type, observations)})
     # kapture stores a colour per point; black means unknown
     write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
@@ -227,7 +230,7 @@ def _write_map(
 
 
 class MakePoints(PipelineStage):
-    """Triangulate the map's points, or lift them from keypoints through depth."""
+    """Triangulate the map's points, or backproject them from keypoints with depth maps."""
 
     name = "points"
     version = 3

@@ -53,9 +53,10 @@ from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageW
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options, RigidTransform
 
-# a point that loses observations is dropped when fewer remain
+# a point that loses observations is dropped if fewer than this remain
 _MIN_OBSERVATIONS = 2
-# images with the same centre form a scan; lifted points are compared with the nearest scans
+# images with the same centre form a scan; points from one depth map are compared with the nearest
+# scans
 _SAME_CENTRE_M = 1e-3
 _NEIGHBOURING_SCANS = 10
 
@@ -64,7 +65,7 @@ Mask = NDArray[np.bool_]
 
 
 class FilterReport(BaseModel):
-    """Removals of one filter; ``checked`` counts the items it could judge."""
+    """Removals of one filter; ``checked`` counts the points or observations that it could judge."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -83,7 +84,7 @@ class MapSelection:
         self.xyz = np.ascontiguousarray(source.points3d()[:, :3])
         self._of_type = source.observations()
         types = list(self._of_type.values())
-        # no localization uses observations by images without a pose
+        # localization does not use observations by images without a pose
         poses = self.data.poses()
         observing = {image for seen in types for image in seen.image_names}
         self.images = sorted(observing.intersection(poses))
@@ -96,7 +97,7 @@ class MapSelection:
         self._sizes = [len(seen) for seen in types]
         point_ids = _joined([seen.point_ids for seen in types], np.int64)
         image_ids = _joined(rows, np.int32)
-        # sort by point across types, as within one type
+        # each type is sorted by point; sort all types together by point
         self._order: Any = slice(None) if len(types) == 1 else np.argsort(point_ids, kind="stable")
         self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
@@ -148,7 +149,7 @@ class MapSelection:
             )
         )
         if self._covariances is not None and (gone & ~points[self.point_ids]).any():
-            self._covariances = None  # points that lose only some observations get less certain
+            self._covariances = None  # points that lose some observations become less certain
         self.kept &= ~gone
         self.kept_points &= ~points
 
@@ -252,8 +253,9 @@ def _verify_depth(
 ) -> None:
     """Drop observations and points that depth maps contradict.
 
-    A lifted point, seen by one image that has depth, agrees with that depth, so it is compared with
-    other scans and dropped when more of them see through it than have a surface there.
+    A point with one observation, by an image with depth, was lifted (backprojected) from that depth
+    and agrees with it. It is compared with nearby scans instead, and dropped if more of them see
+    through it than have a surface at its position.
     """
     records = depth_records(selection.data) if options.max_sigmas is not None else {}
     folder = selection.source
@@ -325,7 +327,7 @@ def _scans(
         for scan, row, cam in zip(scan_of.tolist(), rows, cams, strict=True):
             views[scan][row] = with_depth[row], cam
         centres = centres[np.unique(scan_of, return_index=True)[1]]
-        # index 0 is the scan itself
+        # the nearest is the scan itself, which is removed below
         nearest = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
         neighbours = cKDTree(centres).query(centres, k=nearest)[1] + len(scans)
         scans += [
@@ -343,9 +345,9 @@ def _votes_of_other_scans(
     options: DepthVerificationOptions,
     work: Work,
 ) -> tuple[NDArray[np.int64], Mask]:
-    """Return votes (L,) of nearby scans, and the lifted points they could judge.
+    """Return the sums of votes (L,) of nearby scans, and the lifted points that they could judge.
 
-    A scan votes +1 if it has a surface at the point, -1 if it sees through it.
+    A scan votes +1 if it has a surface at the point, -1 if it sees through the point.
     """
     scan_of = np.full(len(observed.cameras), -1)
     for number, scan in enumerate(scans):
@@ -430,7 +432,7 @@ def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None
 
 
 class RefineMap(PipelineStage):
-    """Remove map points that images or depth contradict, and uncertain ones."""
+    """Remove map points that depth maps contradict, and uncertain points."""
 
     name = "map"
     version = 3

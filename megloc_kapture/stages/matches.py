@@ -71,9 +71,10 @@ _log = logging.getLogger(__name__)
 
 CACHED_IMAGES = 80  # in each process; about 250 MB of RootSIFT
 _PAIRS_PER_ITEM = 32  # pairs of one image, whose features are read once
-# image groups in which the given poses are checked against the matches
+# the given poses are checked against the matches within this number of image groups
 _CHECKED_GROUPS = 6
-_RANKS = (0, 1, 3, 7, 15)  # ranks of the other group members among the images paired with the first
+# a group has one image, and those with these ranks among the images that are paired with it
+_RANKS = (0, 1, 3, 7, 15)
 
 
 Verification = KnownPoseOptions | TwoViewOptions | None
@@ -90,7 +91,8 @@ class SecondMatchingOptions(Options):
     pairs: int = Field(
         default=5,
         gt=0,
-        description="pairs of each query and each map image, those with the most verified matches",
+        description="number of pairs per image that are matched again: those of a query, or of a "
+        "map image, that have the most verified matches",
     )
 
 
@@ -146,7 +148,7 @@ def match_pairs(
 ) -> dict[str, int]:
     """Match image pairs of two folders and write the verified matches; return counts for the log.
 
-    A pair without verified matches is written too, which marks it as done.
+    A pair without verified matches is also written, which marks it as finished.
     """
     within_one = first.root == second.root
     # within a map (a, b) and (b, a) are one pair, stored in one file
@@ -186,9 +188,10 @@ def match_pairs(
 def best_pairs(
     verified: Mapping[tuple[str, str], int], number: int, *, of_both: bool
 ) -> list[tuple[str, str]]:
-    """Return the ``number`` pairs with the most verified matches of each first image, sorted.
+    """Return the ``number`` pairs with the most verified matches of each first image.
 
-    With ``of_both`` also those of each second image. Ties are broken by name.
+    With ``of_both``, also those of each second image; a pair then counts for both of its images.
+    Ties are broken by name, and the result is sorted by name.
     """
     chosen: set[tuple[str, str]] = set()
     taken: Counter[str] = Counter()
@@ -228,7 +231,7 @@ def check_given_poses(
 
 
 def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
-    """Sample pairs within groups of similar images spread over the map."""
+    """Sample pairs within groups of similar images; the groups are spread over the map."""
     paired: dict[str, list[str]] = {}
     for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.query, pair.map)):
         paired.setdefault(pair.query, []).append(pair.map)
@@ -350,7 +353,10 @@ def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> Ve
 def verification_of(
     options: Verification, b_from_a: Callable[[], RigidTransform | None] = lambda: None
 ) -> Verify:
-    """Return a verifier; without a known relative pose it rejects every match."""
+    """Return a function that selects the correct matches.
+
+    Verification by known poses rejects every match if the relative pose is unknown.
+    """
 
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
         rows_a, rows_b = matches.T
@@ -433,7 +439,7 @@ class MatchMapping(PipelineStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping = work.folder(self.layout.mapping(), FEATURES)
         pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
-        # poses of photographs are estimated from matches, so they cannot contradict them
+        # the poses of photographs are not given, but estimated from the same matches
         if isinstance(self.verification(), KnownPoseOptions) and not self.layout.posed:
             name = self.options.main_type()
             check_given_poses(mapping, pairs, name, self.options.make_matcher(name), work)

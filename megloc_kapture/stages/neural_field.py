@@ -64,11 +64,11 @@ from megloc_kapture.values import Camera, Device, Failure, ImageFeatures, Option
 
 FIELD_FILE, MANIFEST_FILE = "field.safetensors", "field.json"
 STATE_FILE = "field.state.pt"  # during training
-# neighbours per camera for views between cameras, and their largest viewing angle
+# neighbours per camera for views between cameras; largest angle between viewing directions
 _NEIGHBOURS, _MAX_ANGLE_DEG = 2, 45.0
-# alignments after the pose is solved, each with a new rendering
+# alignments of the solved pose, each with a new rendering
 _ALIGNMENTS = 2
-# relative depth difference of neighbouring pixels above which they are an edge, not lifted
+# neighbouring pixels with a larger relative depth difference are an edge, and are not used
 _MAX_JUMP = 0.05
 _MAX_ERROR_PX = 3.0
 
@@ -159,7 +159,7 @@ def _opened(file: WeightsFile, device: Device) -> NeuralField:
 
 
 def views_between(data: KaptureData) -> KaptureData:
-    """Create views halfway between each camera and its nearest neighbours of similar direction.
+    """Create views halfway between each camera and its nearest cameras with a similar direction.
 
     New sensor ids let kapture merge the renderings with the map.
     """
@@ -229,7 +229,7 @@ def render_along(
     ----------
     appearance : training image whose lighting is used; the mean of all by default.
     max_side_px : longer side of the renderings; larger cameras are scaled down.
-    min_shown : smallest share of pixels with depth; views with less are left out.
+    min_shown : smallest proportion of pixels with depth; views with less depth are left out.
     """
     poses = data.poses()
     require(poses, "no image here has a pose")
@@ -282,7 +282,7 @@ class FieldRefinerOptions(Options):
         default=320, ge=64, description="longer side of the rendering; larger queries are reduced"
     )
     max_translation_m: float = Field(
-        default=0.5, gt=0, description="largest accepted movement of the centre"
+        default=0.5, gt=0, description="largest accepted movement of the camera centre"
     )
     max_rotation_deg: float = Field(default=5.0, gt=0, description="largest accepted rotation")
 
@@ -290,10 +290,10 @@ class FieldRefinerOptions(Options):
 class FieldRefiner:
     """Plugin ``field``: match the query with the field's rendering at its pose.
 
-    Features of query and rendering are matched and lifted by rendered depth, and the pose is solved
-    (as in GS-CPR, Liu et al., ICLR 2025). New renderings are aligned with the query, and the pose
-    accepted, as by the ``rendering`` refiner. The lighting is fitted on alternate squares of the
-    query, and the others decide on acceptance.
+    Features of query and rendering are matched, and the rendered depth gives 3D points, from which
+    the pose is solved (as in GS-CPR, Liu et al., ICLR 2025). Then new renderings are aligned with
+    the query, and the pose is accepted or rejected, as by the ``rendering`` refiner. The lighting
+    is fitted on one half of a checkerboard over the query; acceptance uses the other half.
     """
 
     name = "field"

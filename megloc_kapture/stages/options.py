@@ -42,10 +42,10 @@ def _first_twice(names: Sequence[str]) -> str | None:
 
 
 class LocalFeaturesChoice(PluginChoice):
-    """A local feature extractor, its options, and the matching of its features."""
+    """A local feature extractor, its options, and the matcher of its features."""
 
     matching: PluginChoice | None = Field(
-        default=None, description="matcher of this type; none: option matching of the run"
+        default=None, description="matcher of these features; none: the option matching of the run"
     )
 
 
@@ -79,12 +79,13 @@ class PipelineOptions(Options):
     query_pairs: QueryPairsOptions = QueryPairsOptions()
     reranking: RerankingOptions = RerankingOptions()
     matching: PluginChoice = Field(
-        default=PluginChoice(name="nn"), description="matcher of feature types without their own"
+        default=PluginChoice(name="nn"),
+        description="matcher of local features, unless local_features sets another matcher",
     )
     verification: Literal["geometric", "mapping", "none"] = Field(
         default="geometric",
-        description="verification of matches: by known poses within the map, by a two-view model "
-        "for queries; mapping: only within the map",
+        description="verification of matches; geometric: by known poses within the map, by a "
+        "two-view model for queries; mapping: only within the map",
     )
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
@@ -92,8 +93,8 @@ class PipelineOptions(Options):
     guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
     map: Literal["triangulate", "lift"] = Field(
         default="triangulate",
-        description="map points: triangulated from matches, or lifted from keypoints through depth "
-        "maps",
+        description="source of map points; triangulate: matches; lift: keypoints that are "
+        "backprojected with depth maps",
     )
     triangulation: TriangulationOptions = TriangulationOptions()
     refinement: MapRefinementOptions = MapRefinementOptions()
@@ -102,7 +103,7 @@ class PipelineOptions(Options):
     pose_refinement: PoseRefinementOptions = PoseRefinementOptions()
     stages: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="additional stages of other packages, by name, with their options",
+        description="third-party stages by name, with their options",
     )
 
     @property

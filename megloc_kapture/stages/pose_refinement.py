@@ -59,9 +59,9 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Camera, LocalizationResult, Options, Pose, RigidTransform
 
-# map images held out at once; a larger window wastes work after the last one needed
+# map images held out in parallel; the test stops early, so a larger number wastes more work
 _WINDOW = 4
-# map images a refiner may choose from: the nearest with a similar viewing direction
+# largest number of reference images of a pose: the nearest with a similar viewing direction
 _MAX_REFERENCES = 30
 
 
@@ -71,7 +71,7 @@ class PoseRefinementOptions(Options):
     )
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
-        """Select refiners, in this order; known ones keep their options."""
+        """Select refiners, in this order; those already in the options keep their settings."""
         chosen = chosen_by_name(self.by, names)
         return PoseRefinementOptions.model_validate({**self.model_dump(), "by": chosen})
 
@@ -85,8 +85,8 @@ class PoseRefinementOptions(Options):
 class MapRefiners:
     """Pose refiners of a map; thread-safe.
 
-    Refiners that need a consistent map are used only in coordinate frames that pass a test on
-    held-out map images.
+    Refiners that need a consistent map are used only in coordinate frames that pass a consistency
+    test with held-out map images.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class MapRefiners:
         return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
 
     def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
-        """Test the coordinate frames of these poses that are not tested yet."""
+        """Test the map's consistency in the frames of these poses, once per coordinate frame."""
         with self._lock:
             for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
                 self._verdicts[frame] = [
@@ -147,13 +147,16 @@ class MapRefiners:
         ]
 
     def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Test the frame; return ``references`` and ``distrusted`` for :func:`apply_refiners`."""
+        """Return ``references`` and ``distrusted`` for :func:`apply_refiners`.
+
+        :meth:`test` must be called for the pose first.
+        """
         frame = self._frame(pose)
         near = self._by_frame[frame].near(
             pose.cam_from_world,
             pose.candidates,
             max_references=_MAX_REFERENCES,
-            # a pose of another program has no cluster
+            # a third-party pose has no candidates; the nearest map images are used
             only_first=bool(pose.candidates),
         )
         return tuple(near), tuple(
@@ -241,9 +244,10 @@ def refine_poses(
 ) -> dict[str, float]:
     """Refine the poses of localized queries and write them as a new localization folder.
 
-    Failed queries and fallback poses stay unchanged. ``map_folder`` and ``query`` provide what the
-    refiners need: images, masks, depth maps, points. ``refinement.csv`` has the measures of each
-    refiner, ``map_consistency.csv`` those of each coordinate frame. Return counts for the log.
+    Failed queries and fallback poses stay unchanged. ``map_folder`` and ``query`` provide images,
+    masks, depth maps and points to the refiners. ``refinement.csv`` gets a row per query and
+    refiner, ``map_consistency.csv`` a row per tested coordinate frame and refiner. Return counts
+    for the log.
     """
     refiners = MapRefiners(map_folder, restrictions, options, work.placement)
     data = localized.read()
@@ -282,7 +286,7 @@ def refine_poses(
 
 
 def _read_results(localized: KaptureFolder) -> dict[str, LocalizationResult]:
-    """Read results by name; localized queries become poses with covariances."""
+    """Read results by name; those of localized queries are :class:`Pose`, with covariances."""
     results = read_status(localized.root / STATUS_FILE)
     table = localized.root / COVARIANCE_FILE
     covariances = read_covariances(table) if table.is_file() else {}

@@ -1,7 +1,7 @@
 """Stage: resized, undistorted and masked images, as a new kapture without features and points.
 
-Names, poses, rigs, records and sensor ids are kept. Unchanged files and depth maps are linked. The
-masks of all sources are combined by AND.
+Names, poses, rigs, records and sensor ids are kept. Unchanged images and depth maps are linked. The
+masks of all sources are combined: a pixel is used if all masks use it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options
 
-# keypoints move by 0.03 px (median); files have a third of the size of PNG
+# the loss shifts detected keypoints by 0.03 px (median); files have a third of the size of PNG
 JPEG_QUALITY = 98
 
 Mask = NDArray[np.bool_]
@@ -92,7 +92,7 @@ class MaskOptions(Options):
 def mask_files(
     folder: KaptureFolder, images: Iterable[str], user_masks: Path | None
 ) -> dict[str, dict[str, Path]]:
-    """Find mask files by image and source (``own`` or ``user``)."""
+    """Find mask files by image and source: ``own`` of the kapture, ``user`` of ``user_masks``."""
     if user_masks is not None and not user_masks.is_dir():
         raise DataError("no such folder of masks", path=user_masks)
     files_of = {}
@@ -158,7 +158,7 @@ def _drawn(fixed: FixedMask, width: int, height: int) -> Mask:
 
 @dataclass(frozen=True)
 class ClassMasks:
-    """A segmenter with its ignored classes, in the order of their labels."""
+    """A segmenter with the classes to mask, ``dynamic``, in the order of their labels."""
 
     segmenter: Segmenter
     dynamic: tuple[str, ...]
@@ -194,7 +194,7 @@ class ClassMasks:
 def find_unchanging_regions(
     folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
 ) -> dict[str, UnchangingRegion]:
-    """Find the static region of each camera, by sensor id; it is falsy if there is none.
+    """Find the static region of each camera by sensor id; a missing region is falsy, with a reason.
 
     ``sequences`` are folders with more images of these cameras: for queries, the map.
     """
@@ -239,7 +239,8 @@ def _edges(image: tuple[Path, Camera]) -> NDArray[np.float32]:
 class ProcessedFrame:
     """An image after pre-processing, with lazily computed pixels and masks.
 
-    ``read`` returns uint8 (H, W, 3) RGB, ``masks`` bool (H, W), True = use, by source.
+    ``read`` returns the original image, uint8 (H, W, 3) RGB; ``masks`` the original masks by
+    source, bool (H, W), True = use.
     """
 
     def __init__(
@@ -261,14 +262,14 @@ class ProcessedFrame:
 
     @property
     def written(self) -> NDArray[np.uint8]:
-        """Return the pixels to write: one channel for grey images, a third of the size."""
+        """Return the pixels to write; a grey image has only one channel."""
         red = self.pixels[..., 0]
         grey = all(np.array_equal(red, self.pixels[..., channel]) for channel in (1, 2))
         return np.ascontiguousarray(red) if grey else self.pixels
 
     @cached_property
     def stored(self) -> NDArray[np.uint8]:
-        """Return the new image as read back, after JPEG loss."""
+        """Return the new image as it reads back from its file, with JPEG loss."""
         if not self.plan.changes_pixels:
             return self.pixels
         read = image_as_read_back(self.written, self.name, jpeg_quality=JPEG_QUALITY)
@@ -312,7 +313,7 @@ def _process(
     classes: ClassMasks | None,
     job: tuple[str, Path, FramePlan, bool, Mapping[str, Path], Mapping[str, Mask]],
 ) -> dict[str, float]:
-    """Write one image and its mask; return its masked shares by source and ``all``."""
+    """Write one image and its mask; return the proportion of masked pixels by source and in all."""
     image, source, plan, link, mask_paths, standing = job
     sensors, camera = output / "sensors", plan.original
     write = partial(write_image, jpeg_quality=JPEG_QUALITY)
@@ -350,11 +351,11 @@ def preprocess_images(
 ) -> dict[str, float]:
     """Write a kapture with pre-processed images, cameras and masks.
 
-    Return counts for the log, including the share of pixels masked by each source.
+    Return counts for the log, including the proportion of pixels masked by each source.
 
-    ``sensors/masks/IMAGE.png`` (0 = ignore) exists for images with masked or invalid pixels,
-    ``sensors/classes`` has the segmenter's labels. ``sequences`` are more folders in which to find
-    static regions: for queries, the map.
+    ``sensors/masks/IMAGE.png`` (0 = ignore) is written for images that have a mask of any source,
+    or pixels outside the original. ``sensors/classes`` has the segmenter's labels. ``sequences``
+    are more folders in which to find static regions: for queries, the map.
     """
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
@@ -415,7 +416,10 @@ def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
 
 
 def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> list[str]:
-    """Report cameras without a static region; if all lack it, a fallback is required."""
+    """Report cameras without a static region.
+
+    If all cameras have too few images, a fixed fallback mask is required.
+    """
     remarks = [f"camera {name}: {r.reason}" for name, r in sorted(regions.items()) if not r]
     if regions and not (have_fallback or any(region.frontier for region in regions.values())):
         raise OptionError(f"no static region is found: {remarks[0]}")
@@ -423,7 +427,7 @@ def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> li
 
 
 def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureData:
-    """Replace the processed cameras; unchanged ones keep their exact digits."""
+    """Replace the cameras that change; unchanged cameras keep their exact digits."""
     sensors = dict(data.sensors)
     for sensor_id, plan in plans.items():
         if plan.processed != plan.original:
@@ -433,7 +437,7 @@ def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureD
 
 
 def _unlink_folders(output: Path) -> None:
-    """Remove linked folders, so that user data behind the links is not overwritten."""
+    """Remove links to folders, so that user data behind the links is not overwritten."""
     for name in ("records_data", "masks", CLASSES):
         path = output / "sensors" / name
         if path.is_symlink():
@@ -489,7 +493,8 @@ class Preprocess(PipelineStage):
         options, counts = self.options.preprocessing, dict[str, float]()
         for folder in (mapping, *queries):
             name, out = folder.root.name, work.out / PREPROCESSED / folder.root.name
-            # a camera may have few queries, or only night queries
+            # static regions of queries also use the map's images, as a camera may have few queries
+            # or only night queries
             others = [] if folder is mapping else [mapping]
             counted = preprocess_images(folder, out, options, sequences=others, work=work)
             counts |= {f"{name}_{key}": count for key, count in counted.items()}

@@ -1,7 +1,8 @@
 """Stage: cluster-wise localization of queries from matches with map images.
 
-Candidates of a query are clustered by location and each cluster gives a pose. A ranker selects
-one, which is refined with the images of its cluster (MegLoc, "Cluster-wise localization").
+The candidates of a query are clustered by location, and each cluster gives a pose. A ranker selects
+the best pose, which is refined with the images of its cluster (MegLoc, "Cluster-wise
+localization").
 """
 
 from __future__ import annotations
@@ -111,8 +112,8 @@ def write_localized(
 
     Parameters
     ----------
-    fallback : pose of a failed query: none, that of its best retrieved image, or the one derived
-        from a localized camera of the same rig and timestamp.
+    fallback : pose of a failed query: "none"; "retrieval", the pose of its best retrieved image;
+        "rig", derived from a localized camera of the same rig and timestamp.
     first_candidates : best retrieved map image and its pose by query, for "retrieval".
     timing : optional file for seconds per query and step.
     """
@@ -161,7 +162,7 @@ def write_localized(
 def write_result_tables(
     output: Path, poses: Mapping[str, RigidTransform], results: Sequence[LocalizationResult]
 ) -> None:
-    """Write tables of poses, status, covariances and, if there is one, refinement."""
+    """Write tables of poses, status and covariances; if a pose was refined, also of refinement."""
     write_poses(output / POSES_FILE, poses)
     write_status(output / STATUS_FILE, results)
     write_covariances(output / COVARIANCE_FILE, results)
@@ -198,7 +199,7 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     if not reasons:
         return {}
     if len(reasons) == len(names):
-        # report the target, as the link may be temporary
+        # report the target of the link, as the link may be temporary
         raise DataError(reasons[names[0]], path=Path(os.path.realpath(folder.image_path(names[0]))))
     records = {key: name for key, name in data.records_camera.items() if name not in reasons}
     write_sensors(query, replace(data, records_camera=records))
@@ -224,9 +225,9 @@ def _fault(spec: FolderSpec, name: str) -> str:
     return ""
 
 
-_FIRST_TURN = 8
-# below this even the right pose can be decimetres off, which more candidates improve
-# (docs/performance.md)
+_FIRST_TURN = 8  # candidates that are matched first; each further turn doubles their number
+# with fewer inliers even a correct pose can be off by decimetres, and matching more candidates
+# improves it (docs/performance.md)
 _SURE_INLIERS = 30
 
 
@@ -234,7 +235,7 @@ class LocalizationOptions(Options):
     clusters: ClusterOptions = ClusterOptions()
     rank: PluginChoice = Field(
         default=PluginChoice(name="distinctive"),
-        description="method that selects the query's pose among the clusters'",
+        description="method that selects the query's pose among the poses of the clusters",
     )
     pose: AbsolutePoseOptions = AbsolutePoseOptions()
     min_confidence: float = Field(
@@ -253,8 +254,8 @@ class LocalizationOptions(Options):
     rigs: bool = Field(default=False, description="localize all cameras of a rig jointly")
     fallback: Fallback = Field(
         default="none",
-        description="pose of a failed query: none, that of its first candidate, or that of "
-        "another camera through the rig",
+        description="pose of a failed query; retrieval: that of its first candidate; rig: derived "
+        "from another camera of the rig; none: no pose",
     )
 
     def make_ranker(self, placement: Placement = AUTO) -> PoseRanker:
@@ -279,7 +280,7 @@ def localize_unit(
     Parameters
     ----------
     candidates : map images, best first.
-    frame_of : names the coordinate frame of a map image.
+    frame_of : returns the name of a map image's coordinate frame.
     centers : camera centres (3,) of the candidates in the world.
     """
 
@@ -361,8 +362,9 @@ def localize_query(
     """Localize a query, or the cameras of a rig; return a result per camera.
 
     ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
-    With ``sure_confidence``, candidates that are not matched yet are matched in turn until the
-    pose is certain (docs/performance.md). See :func:`localize_unit`.
+    With ``sure_confidence``, sources that are ``in_turn`` match the best candidates first, and more
+    of them only until all poses are certain (docs/performance.md). Parameters: see
+    :func:`localize_unit`.
     """
 
     def solve(count: int) -> list[Pose | Failure]:
@@ -391,13 +393,13 @@ def localize_query(
     return solve(num_candidates)
 
 
-# a unit, the candidates of each image, and their coordinate frames
+# a unit (a query, or the cameras of a rig), the candidates of each image, and their frames
 _Job = tuple[Unit, Sequence[Sequence[str]], Mapping[str, str]]
 
 
 @dataclass(frozen=True)
 class _StoredQueries:
-    """Localizes units from stored matches, in any process."""
+    """Localizes a query, or the cameras of a rig, from stored matches; picklable."""
 
     map: FolderSpec
     query: FolderSpec
@@ -466,9 +468,10 @@ def localize_from_matches(
     work: Work = HERE,
     scratch: Path | None = None,
 ) -> Iterator[Pose | Failure]:
-    """Localize every query from stored matches of ``local_types``; yield results sorted by unit.
+    """Localize every query from stored matches of ``local_types``; yield results sorted by name.
 
-    The map may use the base type of a guided pyramid type. ``scratch`` holds a temporary map index.
+    Cameras of a rig that are localized jointly stay together. A map may have the base type instead
+    of a guided pyramid type. ``scratch`` is a folder for a temporary map index.
     """
     ranker = options.make_ranker(work.placement)
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
@@ -488,7 +491,7 @@ def localize_from_matches(
 
 
 def type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
-    """Return a map's name of a keypoints type: the type or its base type."""
+    """Return the keypoints type that the map has: ``local_type`` or its base type."""
     names = (local_type, base_type(local_type))
     known = (map_folder.observations(), map_folder.types("keypoints"))
     return next((name for where in known for name in names if name in where), names[-1])

@@ -1,7 +1,8 @@
 """Base class of stages; ``docs/plugins.md`` has an example.
 
-Inputs, outputs, options and version determine when a stage reruns. The order is ``PIPELINE`` in
-``pipeline/evaluation_plan.py``; a stage of another package follows those that write its inputs.
+A stage runs again if its options, inputs, version, plugin code or output names change.
+``PIPELINE`` in ``pipeline/evaluation_plan.py`` defines the order of the stages. A third-party
+stage runs after the stages that write its inputs.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _UNITS = {"px": "px", "m": "m", "percent": "%"}
 
 
 def count_label(name: str, value: float) -> tuple[str, str]:
-    """Format a stage's count as words and figure, e.g. ``keypoints``, ``33,485,000``."""
+    """Return the label and the formatted value of a count: ``keypoints``, ``33,485,000``."""
     words, _, last = name.replace("_", " ").rpartition(" ")
     unit = f" {_UNITS[last]}" if words and last in _UNITS else ""
     words = words if unit else f"{words} {last}".lstrip()
@@ -76,7 +77,7 @@ FEATURES = ""  # the workspace itself holds local and global features
 
 @dataclass(frozen=True)
 class Layout:
-    """Workspace paths for given options; ``posed``: poses of the map images were estimated."""
+    """Workspace paths for given options; ``posed`` means that map poses were estimated."""
 
     options: PipelineOptions
     posed: bool = False
@@ -89,7 +90,7 @@ class Layout:
         return names
 
     def mapping(self) -> str:
-        """Return the kapture folder after pre-processing."""
+        """Return the folder of the map images: with estimated poses, pre-processed, or imported."""
         if self.posed:
             return POSED
         return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
@@ -104,7 +105,7 @@ class Layout:
     def mapping_matches(self) -> tuple[str, ...]:
         if not self.options.triangulates():
             return ()
-        # the first folder that has a pair counts
+        # a pair is read from the first folder that contains it
         again = self.options.matches_again()
         return (MAPPING_PYRAMID, MAPPING_MATCHES) if again else (MAPPING_MATCHES,)
 
@@ -123,11 +124,11 @@ class Layout:
 
 
 LayoutPath = str | Callable[[Layout], str | tuple[str, ...]]
-"""A path in the workspace, or the method of :class:`Layout` that returns it, or several."""
+"""A path in the workspace, or a method of :class:`Layout` that returns one path or several."""
 
 
 def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
-    """Return a hash of the files' names relative to ``root``, sizes and modification times."""
+    """Return a hash of the files' sizes, modification times and names relative to ``root``."""
     digest = hashlib.sha256()
     for file in sorted(files):
         try:
@@ -141,7 +142,7 @@ def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StageWork(Work):
-    """Workspace ``root``, which is read-only, output folder ``out``, and execution context."""
+    """Execution context with the workspace ``root`` (read-only) and the output folder ``out``."""
 
     root: Path
     out: Path
@@ -153,12 +154,12 @@ class StageWork(Work):
         return KaptureFolder(self.path(name), features_dirs=[self.path(part) for part in features])
 
     def folders(self, names: Sequence[str], *features: str) -> list[KaptureFolder]:
-        """Open those of these kapture folders that exist."""
+        """Open the kapture folders of these names; skip missing folders."""
         return [self.folder(name, *features) for name in names if self.path(name).is_dir()]
 
 
 CODE_OF = "code of "
-ROOT = "root"  # the imported folder, among the inputs of an import
+ROOT = "root"  # name of the imported folder among the inputs of an import
 PROTOCOL = "protocol"
 
 
@@ -172,10 +173,10 @@ class Stage(ABC):
     Attributes
     ----------
     version : increase it when the output changes for the same options and inputs.
-    resumes : the unfinished output of an interrupted run is kept, and its items are skipped.
+    resumes : the output of an interrupted run is kept, and the items in it are skipped.
     reads, writes : paths in the workspace; a folder includes its contents.
-    root : folder of user data to import, or None; the same for a whole workspace.
-    placement : device and precision of its networks, in the context of ``run``.
+    root : folder of user data that the stage imports, or None; a workspace has one root.
+    placement : device and precision of the stage's networks; ``run`` gets them with its context.
     """
 
     root: Path | None = None
@@ -203,7 +204,7 @@ class Stage(ABC):
         return ()
 
     def code(self) -> dict[str, str]:
-        """Return code versions of plugins and of stages of other packages."""
+        """Return the code versions of the plugins, and of the stage if it is third-party."""
         plugins = [*self.plugins(), *(() if is_ours(type(self)) else (self,))]
         for plugin in self.plugins():
             plugins += getattr(plugin, "plugins", tuple)()
@@ -212,7 +213,7 @@ class Stage(ABC):
         # mypy does not consider classes hashable
         return {name: code_of(kind) for name, kind in names.items()}  # type: ignore[arg-type]
 
-    def check(self) -> None:  # noqa: B027  # most stages read only what others write
+    def check(self) -> None:  # noqa: B027  # most stages read only outputs of other stages
         """Raise the errors of :meth:`run` that can be found quickly; for dry runs."""
 
     @abstractmethod
@@ -229,7 +230,7 @@ class PipelineStage(Stage):
 
     Attributes
     ----------
-    uses : option keys that determine the output; ``local_features.name`` covers all choices.
+    uses : option keys that determine the output; ``local_features.name`` means all their names.
     explained_by : option keys that best explain whether and how the stage runs.
     """
 

@@ -54,7 +54,7 @@ class StructureOptions(Options):
 
     Attributes
     ----------
-    distance : two images and the distance of their camera centres in metres.
+    distance : two images and the distance between their camera centres in metres.
     gps : latitude and longitude in degrees and height in metres, by image.
     """
 
@@ -77,7 +77,7 @@ class MatchPhotographs(MatchMapping):
 
 
 class FindPoses(PipelineStage):
-    """Find poses and cameras of matched photographs; the largest model becomes the map."""
+    """Estimate poses and cameras of matched photographs; the largest model becomes the map."""
 
     name = "poses"
     version = 3
@@ -101,7 +101,8 @@ class FindPoses(PipelineStage):
             i for i, sensor in model.sensors.items() if sensor not in data.sensors
         ):
             message = (
-                "%d photographs have the size of others but a different camera (zoom or crop): %s"
+                "%d photographs have the same size as others, but a different camera (zoom or "
+                "crop): %s"
             )
             _log.warning(message, len(separate), ", ".join(separate))
         tables = work.out / SIDE_TABLES
@@ -185,7 +186,7 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
 
 
 def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, dict[str, float]]:
-    """Return the model, in metres if the scale is known, its world, and counts for the log."""
+    """Return the world, the model (in metres if the scale is known), and counts for the log."""
     if structure.distance is not None:
         first, second, metres = structure.distance
         for name in (first, second):
@@ -209,7 +210,7 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
 
 
 def _moved(model: Model, scale: float, turned: RigidTransform = _UNTURNED) -> Model:
-    """Return the model in the world ``turned(scale * x)``."""
+    """Return the model after the transform ``x -> turned(scale * x)`` of the world."""
     back, poses = turned.inverse(), {}
     for name, pose in model.poses.items():
         x, y, z = (scale * np.array(pose.translation)).tolist()

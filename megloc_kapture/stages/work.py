@@ -1,7 +1,8 @@
 """Execution context: ordered work with bounded memory, a progress bar, and network batches.
 
-Work runs on an executor with one core per process. Networks on a GPU of this machine run in this
-process only: threads read ahead, one thread computes batches, and the executor does the rest.
+Work runs on an executor with one core per process. Networks on a GPU of this machine run only in
+this process. In batched work (:class:`Batched`), threads then read items ahead, one thread computes
+the batches, and the executor runs the last step.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from megloc_kapture.plugin_loading import AUTO, Placement
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-BATCH = 8  # for batch plugins without a device option
-MOST_AT_ONCE = {"cpu": 1, "cuda": 16}
+BATCH = 8  # batch size of plugins that have a batch method, but no device option
+MOST_AT_ONCE = {"cpu": 1, "cuda": 16}  # batch size by device
 
 
 def on_gpu(plugin: object) -> bool:
@@ -63,9 +64,9 @@ def in_batches(
     *,
     name: Callable[[int], str],
 ) -> list[Result]:
-    """Run a plugin on items in batches, halved when memory runs out.
+    """Run a plugin on items in batches; halve the batches when memory runs out.
 
-    Raise MeglocError if one item does not fit.
+    Raise MeglocError if the memory is too small for a single item.
     """
     key = type(plugin).__qualname__, many, repr(getattr(plugin, "options", None))
     finished: list[Result] = []
@@ -114,13 +115,12 @@ def is_out_of_memory(error: BaseException) -> bool:
     )
 
 
-# threads that read ahead for a GPU, and threads that share a plugin on one
-_READERS = min(os.cpu_count() or 1, 16)
-_THREADS = 4
+_READERS = min(os.cpu_count() or 1, 16)  # threads that read items ahead for a GPU
+_THREADS = 4  # threads that share a plugin on a GPU
 
 
 Track = Callable[[Iterable[Any], int, str], Iterator[Any]]
-"""Progress display of items, their number and a label; yields the items unchanged."""
+"""Progress display: takes items, their number and a label, and yields the items unchanged."""
 
 
 def untracked(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
@@ -148,7 +148,7 @@ def ordered_map(
         while waiting:
             yield waiting.popleft().result()
     except GeneratorExit:
-        # not on errors: a pool that is breaking fails on cancelled futures
+        # cancel only here: after an error, a broken pool fails on cancelled futures
         for future in waiting:
             future.cancel()
         raise
@@ -167,8 +167,9 @@ class Batched(Generic[Item, Result]):
     Attributes
     ----------
     read : reads the arrays of an item.
-    compute : returns one result per item, using ``plugin`` with batch method ``many``.
-    alike : consecutive items with equal keys share a batch; None means single items.
+    compute : returns one result per item; calls ``plugin``.
+    many : name of the plugin's batch method.
+    alike : key of an item; consecutive items with equal keys share a batch. None: one item each.
     finish : optional last step for an item and its result; needs no device.
     """
 
@@ -196,9 +197,9 @@ class Work:
     Attributes
     ----------
     executor : None means this process.
-    num_threads : for libraries with internal threads, such as COLMAP.
+    num_threads : number of threads of libraries with internal threads, such as COLMAP.
     resume : skip items whose output files an interrupted run has written.
-    force : continue despite contradictory input data.
+    force : continue although most given poses contradict the matches.
     placement : device and precision of networks.
     """
 
@@ -220,8 +221,9 @@ class Work:
     ) -> Iterator[Result]:
         """Yield results in the order of the items, with a progress bar.
 
-        ``function`` must be picklable. If one of its ``plugins`` uses a GPU of this machine,
-        threads of this process do the work, so that no other process takes GPU memory.
+        ``function`` must be picklable. ``plugins`` are those that it calls; a :class:`Batched` has
+        its plugin itself. If a plugin uses a GPU of this machine, threads of this process do the
+        work, so that no other process takes GPU memory.
         """
         if total is None:
             items = items if isinstance(items, Sequence) else list(items)
@@ -239,7 +241,7 @@ class Work:
             yield from ordered_map(function, items, executor)
 
     def _has_gpu(self, plugins: Sequence[object]) -> bool:
-        # cluster machines have separate GPUs
+        # workers on other machines do not use the GPU of this machine
         return not getattr(self.executor, "is_elsewhere", False) and any(map(on_gpu, plugins))
 
     def _in_batches(self, steps: Batched[Item, Result], items: Iterable[Item]) -> Iterator[Result]:
