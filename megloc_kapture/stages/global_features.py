@@ -267,9 +267,10 @@ def describe_images(
 def _checked(extractor: GlobalFeatureExtractor, described: Any, label: str) -> list[NDArray[Any]]:
     who = f"plugin {extractor.name!r} on image {label}"
     vectors = [checked_array(who, vector, (None,), "float32") for vector in described]
-    norms = np.array([np.linalg.norm(vector) for vector in vectors])
-    if np.abs(norms - 1.0).max(initial=0) > 1e-3:
-        raise PluginError(f"{who}: a vector of length {norms.max():.4g}, expected 1")
+    for vector in vectors:
+        length = float(np.linalg.norm(vector))
+        if abs(length - 1.0) > 1e-3:
+            raise PluginError(f"{who}: a vector of length {length:.4g}, expected 1")
     return vectors
 
 
