@@ -237,7 +237,7 @@ class RankingScene(Protocol):
     """Data for rankers and refiners, read on demand."""
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
-        """Return RGB pixels (H, W, 3) of a query image; raise DataError if it has none."""
+        """Return RGB pixels (H, W, 3) of a query image; DataError if they are missing."""
         ...
 
     def query_mask(self, name: str) -> NDArray[np.bool_] | None:
@@ -249,7 +249,7 @@ class RankingScene(Protocol):
         ...
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
-        """Return RGB pixels (H, W, 3) of a map image; raise DataError if it has none."""
+        """Return RGB pixels (H, W, 3) of a map image; DataError if they are missing."""
         ...
 
     def map_mask(self, name: str) -> NDArray[np.bool_] | None:
