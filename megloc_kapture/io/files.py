@@ -230,7 +230,7 @@ def link_images(
 
 
 def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
-    """Link folders or images below ``sensors/records_data``, or all of it (``""``), to a dataset."""
+    """Link folders or images below ``sensors/records_data``, or all of it (``""``), to datasets."""
     records = Path(output_root) / "sensors" / "records_data"
     for name, target in links.items():
         link = records / name if name else records
