@@ -166,8 +166,8 @@ class MapImage:
 class TriangulatedPoints:
     """Points float64 (N, 3) in the world frame, mean reprojection errors (N,) and observations.
 
-    An observation has a row of the points, of the images and of the image's keypoints, int64 (O,)
-    each; observations are sorted by point, then image, then keypoint.
+    Each observation refers to a point, an image and a keypoint of this image by row, int64 (O,)
+    each. Observations are sorted by point, then image, then keypoint.
     """
 
     xyz: NDArray[np.float64]

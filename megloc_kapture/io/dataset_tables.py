@@ -11,9 +11,9 @@ world.json          ``official_from_local``, unit and position on earth of the l
 protocol.json       thresholds, format and names of the pose file, conditions and their pools
 ==================  ================================================================================
 
-Imports of datasets write these files; stages and evaluation read them. A missing table has no rows.
-Without world.json, the local frame is the official frame, in metres. Without protocol.json, the
-defaults of :class:`Protocol` hold.
+Imports of datasets and the mapping of photographs write these files; stages and evaluation read
+them. A missing table has no rows. Without world.json, the local frame is the official frame, in
+metres. Without protocol.json, the defaults of :class:`Protocol` hold.
 """
 
 from __future__ import annotations

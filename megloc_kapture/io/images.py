@@ -44,8 +44,8 @@ _ORIENTATION, _MAKE, _MODEL, _EXIF, _GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x882
 # focal length in mm and 35 mm equivalent, focal plane resolution (x, y) and unit, image size
 _FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210, 0xA002, 0xA003)
 _JPEG = (".jpg", ".jpeg")
-# images with other suffixes are written as PNG for these, else as JPEG, under their name; readers
-# detect the format from the content
+# images with these suffixes are written as PNG, those with other unknown suffixes as JPEG; their
+# names do not change, because readers detect the format from the content
 _LOSSLESS = (".pgm", ".pnm", ".gif", ".jp2")
 # images that use more than this fraction of their range are scaled, others are stretched
 _MIN_RANGE = 0.5

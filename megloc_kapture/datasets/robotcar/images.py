@@ -46,7 +46,7 @@ class Selection:
     query_images: Mapping[ImageKey, str]
 
     def is_scored(self, query: ImageKey) -> bool:
-        """Return whether a query counts: in the benchmark, or with a public pose."""
+        """Return whether a query is evaluated: by the benchmark, or because its pose is public."""
         if self.version == 1:
             return query.camera == SCORED_CAMERA
         return query in self.queries.test or query in self.queries.train
