@@ -46,7 +46,7 @@ def require(
 
 
 class OptionError(MeglocError):
-    """An invalid option or argument; the message lists the valid names, if it is about a name."""
+    """An invalid option or argument; a message about an unknown name lists the known names."""
 
 
 def check_option(condition: object, message: str) -> None:

@@ -118,12 +118,12 @@ class Eval(Deciding, Working):
             self._hand_in(console, pose_file, submissions)
             doubtful = done["submission"].counts.get("doubtful", 0)
             # only challenges, which have an adapter, have an evaluation server
-        if doubtful and run.source.adapter is not None:
-            console.say(
-                f"{doubtful:,} poses had too little confidence for the pose file; a server "
-                "counts a missing pose as wrong: --set localization.min_confidence=0 keeps "
-                "every pose"
-            )
+            if doubtful and run.source.adapter is not None:
+                console.say(
+                    f"{doubtful:,} poses had too little confidence for the pose file; a server "
+                    "counts a missing pose as wrong: --set localization.min_confidence=0 keeps "
+                    "every pose"
+                )
         report = workspace.path(EVALUATION) / REPORT_HTML
         if "evaluation" in done and report.is_file():
             console.result(f"report     {shown(report)}")

@@ -138,7 +138,7 @@ class Densify(Reading, StageCommand):
     by: str | None = None
     """Estimator: sweep, colmap or a plugin; if omitted, sweep."""
     points: bool = False
-    """Create 3D points, with their uncertainty, from keypoints without a point and their depth."""
+    """Also create 3D points for keypoints that have none, from their depth, with uncertainty."""
     fuse: Path | None = None
     """Write the fused point cloud to this PLY file."""
     force: Force = False

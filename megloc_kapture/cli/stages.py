@@ -257,7 +257,7 @@ class PairsMapping(Reading, StageCommand):
     covisibility_map: Path | None = None
     """Kapture map of the same images whose points define covisibility; if omitted, the input."""
     features: tuple[str, ...] = ()
-    """Types of global features, several are fused; required if several exist."""
+    """Types of global features; several types are fused. Required if several exist."""
     fusion: FusionMethod | None = None
     """Fusion of several types; if omitted, the preset's."""
     force: Overwrite = False
@@ -299,7 +299,7 @@ class PairsQuery(Reading, StageCommand):
     topk: int | None = None
     """Number of most similar map images per query."""
     features: tuple[str, ...] = ()
-    """Types of global features, several are fused; required if several exist."""
+    """Types of global features; several types are fused. Required if several exist."""
     fusion: FusionMethod | None = None
     """Fusion of several types; if omitted, the preset's."""
     exhaustive: bool = False
