@@ -222,8 +222,8 @@ class DepthEstimator(Protocol):
     ) -> DepthEstimate:
         """Estimate the depth of the reference's pixels.
 
-        Raise MeglocError for unusable views; the image then gets no depth, and ``depth.csv`` the
-        reason.
+        Raise MeglocError for unusable views; the image then gets no depth, and the reason is
+        written to ``depth.csv``.
 
         Parameters
         ----------

@@ -283,7 +283,7 @@ class PoseRefinement:
     before : ``cam_from_world`` before the refinement.
     moved_m, turned_deg : displacement of the pose by the refinement, 0 if it is rejected.
 
-    The last four are set by :mod:`megloc_kapture.stages.pose_refinement`, not by a refiner.
+    The last four fields are set by :mod:`megloc_kapture.stages.pose_refinement`, not by refiners.
     """
 
     cam_from_world: RigidTransform

@@ -183,8 +183,8 @@ class Check(Common):
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Pose file; for 4seasons also the folder of all pose files."""
     data: Path | None = None
-    """Imported dataset or workspace to compare with; if omitted, runs/DATASET-* if only one
-    exists."""
+    """Imported dataset or workspace to compare with; if omitted, the workspace runs/DATASET-*, if
+    it is the only one."""
     json: bool = False
     """Print the result as JSON."""
 

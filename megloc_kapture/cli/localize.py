@@ -144,7 +144,7 @@ class Serve(Reading, Deciding, Common):
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     host: str = "127.0.0.1"
-    """Address to listen on; any other than loopback needs --token-file."""
+    """Address to listen on; an address other than loopback needs --token-file."""
     port: int = 8000
     """Port to listen on; 0: any free port."""
     token_file: Path | None = None

@@ -255,7 +255,7 @@ class PairsMapping(Reading, StageCommand):
     topk: int | None = None
     """Number of most similar images per image (retrieval)."""
     covisibility_map: Path | None = None
-    """Kapture map of the same images whose points define covisibility; if omitted, the input."""
+    """Kapture map of the same images; its points define covisibility. If omitted, the input."""
     features: tuple[str, ...] = ()
     """Types of global features; several types are fused. Required if several exist."""
     fusion: FusionMethod | None = None

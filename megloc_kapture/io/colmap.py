@@ -103,7 +103,7 @@ def undistorted_pinhole(camera: Camera) -> Camera:
 
 
 def focal_from_exif(jpeg: bytes) -> float | None:
-    """Return COLMAP's focal length in pixels from the EXIF of a JPEG file; None without one."""
+    """Return COLMAP's focal length in pixels from the EXIF of a JPEG file, or None."""
     pycolmap = load_pycolmap()
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         path = Path(folder) / "blank.jpg"

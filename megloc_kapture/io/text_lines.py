@@ -26,8 +26,8 @@ MAX_ROTATION_ERROR = 1e-3
 def reading_lines(path: Path, *, comments: bool = False) -> Iterator[Iterator[str]]:
     """Yield an iterator of the stripped lines that are not blank.
 
-    ``comments`` means that lines beginning with # are comments, which are skipped. A DataError in
-    the block gets file and line; so does a ValueError (from ``float``), as a DataError.
+    With ``comments``, lines that begin with # are skipped. A DataError in the block gets file and
+    line. A ValueError, as from ``float``, becomes a DataError with file and line.
     """
     texts = read_text(path).split("\n")
     number: int | None = None

@@ -284,7 +284,7 @@ def select(
 ) -> Selection:
     """Choose recordings by name, or by relocalization files.
 
-    Without either, the first recording with poses is the map and the others are queries.
+    Without names and files, the first recording with poses is the map and all others are queries.
     """
     recordings = find_recordings(root)
     files = find_relocalization_files(root, recordings)

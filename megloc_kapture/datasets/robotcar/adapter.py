@@ -184,7 +184,7 @@ class RobotCar:
         if version == 2 and not test_list.is_file():
             remarks.append(
                 f"Without {test_list.name}, which kapture leaves out, the pose file holds all rear "
-                "images whose poses are not public; the list may be put into the root."
+                "images whose poses are not public; copy the list into the root to use it."
             )
         return self._dataset(
             selection,

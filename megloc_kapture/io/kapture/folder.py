@@ -48,9 +48,7 @@ class KaptureFolder:
         return KaptureFolder(self.root, features_dirs=features_dirs)
 
     def check_features_apart(self, other: KaptureFolder) -> None:
-        """Raise DataError if both folders have an image of one name, but different content, and
-        the same features for it.
-        """
+        """Raise DataError if different images of the same name have the same features in both."""
         for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
             if _same_content(self.image_path(image), other.image_path(image)):
                 continue
