@@ -371,7 +371,7 @@ class FeatureWriter(BlobWriter):
         if not path.exists():
             write_bytes(path, content)
         elif format_config(kind, read_config(path, kind)) != content:
-            raise OutputError(f"{path}: has a different configuration; remove its folder first")
+            raise OutputError(f"{path}: has another configuration; remove its folder first")
         super().__init__(folder)
 
     def __contains__(self, image: str) -> bool:
