@@ -8,8 +8,8 @@
 
 import sys
 
-# pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib, so zlib stays the first import
-# that is not already loaded (tests/test_import_order.py)
+# pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib, so zlib is imported first; sys
+# is always loaded already (tests/test_import_order.py)
 import zlib  # noqa: F401
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,8 @@ from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputErr
 
 if sys.platform == "win32":
     raise ImportError(
-        "megloc-kapture needs what Linux and macOS have and Windows has not (file locks, fork "
-        "servers); on Windows it runs under WSL 2"
+        "megloc-kapture needs file locks and fork servers, which Windows does not have; on Windows "
+        "it runs under WSL 2"
     )
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ __all__ = [
     "train",
 ]
 
-# lazy: an error class does not import numpy, nor a value type the solvers
+# lazy: importing an error class does not import numpy, importing a value type not the solvers
 _LAZY = {
     "values": ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"),
     "pipeline.kapture_map": ("KaptureMap",),
@@ -81,7 +81,7 @@ _LAZY = {
     "pipeline.results": ("Results",),
     "pipeline.export": ("export",),
     "evaluation.evaluate": ("evaluate",),
-    "api": tuple(name for name in __all__ if name != "__version__"),  # the others
+    "api": tuple(name for name in __all__ if name != "__version__"),  # all remaining names
 }
 
 

@@ -85,7 +85,7 @@ class Map:
         return f"Map({str(root)!r}: {len(images)} images, features {types})"
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
-        """Return the cached localizer of :meth:`localize` with these pose refiners."""
+        """Return the localizer that :meth:`localize` uses with these pose refiners; cached."""
         refiners = (refine,) if isinstance(refine, str) else tuple(refine)
         if refiners not in self._localizers:
             options = self.options
@@ -153,16 +153,16 @@ class Map:
     ) -> Pose | Failure | Results:
         """Localize one image, or all images of a list or a folder.
 
-        A single image returns a Pose, or a Failure, which is falsy and has a reason. A list or a
-        folder returns lazy :class:`Results`, a mapping from image name to either.
+        For a single image, return a Pose, or a Failure, which is falsy and has a reason. For a list
+        or a folder, return :class:`Results`, a lazy mapping from image name to Pose or Failure.
 
         Parameters
         ----------
         query : image file; uint8 (H, W, 3) RGB; a pillow image; a list of image files; a kapture
             folder, or a folder of plain images.
         camera : intrinsics of the pixels as stored, with COLMAP's models and pixel origin. Without
-            one, an image is rotated upright by its EXIF orientation, and its focal length,
-            initialised from EXIF or a guess, is estimated with the pose: ``Pose.camera``.
+            a camera, an image is rotated upright by its EXIF orientation, and its focal length is
+            initialised from EXIF or a guess and estimated with the pose, see ``Pose.camera``.
         prior : names of the map images to match with one image.
         refine : names of pose refiners, applied in order: icp, rendering.
         workers : threads, for lists and folders.
@@ -222,13 +222,13 @@ def open_map(
     features_dirs: Sequence[Path | str] = (),
     pixel_origin: PixelOriginChoice = "auto",
 ) -> Map:
-    """Open a map, from this package or another tool, with all keypoint types that have points.
+    """Open a map of this package or of another tool, with all keypoint types that have points.
 
     Parameters
     ----------
-    path : kapture map, or a COLMAP model or workspace, which is imported into the user's cache when
-        new or changed (:func:`megloc_kapture.pipeline.map_making.kapture_of`).
-    preset, set : localization options; ``{"localization.rank.name": "perceptual"}``.
+    path : kapture map, or a COLMAP model or workspace, which is imported into the user's cache if
+        it is new or has changed (:func:`megloc_kapture.pipeline.map_making.kapture_of`).
+    preset, set : localization options, ``set`` as ``{"localization.rank.name": "perceptual"}``.
     features_dirs : additional folders with features.
     pixel_origin : pixel origin of the map's intrinsics; auto detects it.
     """
@@ -266,13 +266,13 @@ def build_map(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> Map:
-    """Build a map of images with poses: features, pairs, matches, points, refinement.
+    """Build a map from images with poses: features, pairs, matches, points, refinement.
 
     Parameters
     ----------
     mapping : kapture folder with images and poses; it is not changed.
-    workspace : folder of all results, ``runs/MAPPING-PRESET`` by default; up-to-date results are
-        reused, the map is its folder ``map``.
+    workspace : folder of all results, ``runs/MAPPING-PRESET`` by default. Up-to-date results in it
+        are reused. Its folder ``map`` is the map.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers are used instead.
     """
@@ -295,19 +295,19 @@ def map_photographs(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> Map:
-    """Make a map of photographs without poses; see :mod:`megloc_kapture.pipeline.map_making`.
+    """Make a map from photographs without poses; see :mod:`megloc_kapture.pipeline.map_making`.
 
     Parameters
     ----------
     images : photographs, videos, or folders of them.
     camera : camera of all images, for the pixels as stored; without it, focal lengths are
         estimated with the poses.
-    scale : ``"gps"`` for EXIF positions, or the names of two photographs and their distance in
-        metres. Without it the map is not metric: ``map.kapture_map.unit``.
-    mapper : COLMAP's, incremental or global.
-    workspace : folder of all results, ``runs/IMAGES-PRESET`` by default; up-to-date results are
-        reused, the map is its folder ``map``, ``megloc/unregistered.csv`` lists the missing
-        photographs.
+    scale : ``"gps"`` for EXIF positions, or the names of two photographs and the distance between
+        their cameras in metres. Without it the map is not metric, see ``map.kapture_map.unit``.
+    mapper : COLMAP's mapper: incremental or global.
+    workspace : folder of all results, ``runs/IMAGES-PRESET`` by default. Up-to-date results in it
+        are reused. Its folder ``map`` is the map; its ``megloc/unregistered.csv`` lists the
+        photographs that are missing from the map.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers are used instead.
     """
@@ -330,7 +330,7 @@ class FinishedRun:
 
     Attributes
     ----------
-    pose_file : the file to submit; a folder if there are several.
+    pose_file : the file to submit, or a folder if several files are to be submitted.
     """
 
     workspace: Path
@@ -378,11 +378,11 @@ def run(
 
     Parameters
     ----------
-    root : the dataset as published; searched in MEGLOC_DATA by default.
-    preset : by default the one in the dataset's benchmark file.
-    set : options, ``{"localization.rank.name": "perceptual"}``.
-    workspace : ``runs/DATASET-PRESET`` by default; for kapture folders
-        ``runs/kapture-ROOT-PRESET``.
+    root : the dataset as published; searched below MEGLOC_DATA by default.
+    preset : by default the preset in the dataset's benchmark file.
+    set : options, as ``{"localization.rank.name": "perceptual"}``.
+    workspace : ``runs/DATASET-PRESET`` by default, and ``runs/kapture-ROOT-PRESET`` for kapture
+        folders.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers are used instead.
     """
@@ -410,7 +410,7 @@ def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any
 def match(
     matcher: str, first: ImageFeatures, second: ImageFeatures, **options: Any
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Match two images with a named matcher; return rows, int64 (K, 2), and scores (K,).
+    """Match two images with a named matcher; return keypoint rows, int64 (K, 2), and scores (K,).
 
     PluginError or MissingWeightsError if the matcher cannot be loaded.
     """
@@ -432,7 +432,7 @@ def solve_pose(
 
     Parameters
     ----------
-    points_px : (N, 2), first pixel's centre at (0.5, 0.5).
+    points_px : (N, 2), the first pixel's centre at (0.5, 0.5).
     points_world : (N, 3).
     max_error_px : inlier threshold of the reprojection error.
     """
@@ -454,7 +454,7 @@ def train(
 ) -> dict[str, float]:
     """Train SuperGlue or descriptors as ``megloc train`` does; an interrupted run is resumed.
 
-    Returns the last row of the training curves by column.
+    Return the last row of the training curves by column.
 
     Parameters
     ----------
@@ -462,8 +462,8 @@ def train(
     output : ``X.safetensors``; for further files see :func:`megloc_kapture.training.train.train`.
     kaptures, held_out : kapture folders with poses and depth, for training and for evaluation.
     photographs : folders of images, for training with random homographies.
-    features : extractor of the matched features, or of the frozen detector.
-    set : options, ``{"steps": 20000}``.
+    features : name of the extractor whose features are matched, or whose detector is frozen.
+    set : options, as ``{"steps": 20000}``.
     """
     from megloc_kapture.training.train import TASKS
     from megloc_kapture.training.train import train as run_training

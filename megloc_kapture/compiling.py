@@ -1,7 +1,7 @@
-"""Compilation of loops: at the first call, cached once per machine.
+"""Compilation of loops with numba at their first call; the result is cached on disk.
 
-numba invalidates its cache only for changes of the loop's own file. So the cached name contains a
-digest of the called loops of other files.
+numba compiles a cached loop again only if the loop's own file changes. The name in the cache
+therefore contains a digest of the other files that define loops called by this one.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -18,10 +18,10 @@ from numba.core.dispatcher import Dispatcher
 
 
 def compiled_loop(function: Callable[..., Any]) -> Any:
-    """Compile at the first call, without the interpreter's lock, and cache the result on disk.
+    """Compile a function at its first call, to run without the GIL, and cache the result on disk.
 
-    Division by zero gives infinity or NaN, as in numpy. Loops called from other files must be
-    imported by name beforehand.
+    Division by zero gives infinity or NaN, as in numpy. If the function calls loops from other
+    files, import these by name before this decorator runs.
     """
     called = _called_elsewhere(function)
     if called:
@@ -33,13 +33,13 @@ def compiled_loop(function: Callable[..., Any]) -> Any:
 
 
 def _called_elsewhere(function: Callable[..., Any]) -> str:
-    """Return a digest of loops imported from other files, or an empty text without any."""
+    """Return a digest of the files of imported loops; an empty text if none is imported."""
     others = [
         value.py_func
         for value in function.__globals__.values()
         if isinstance(value, Dispatcher) and value.py_func.__module__ != function.__module__
     ]
-    # their names contain the digests of the loops that they call
+    # the name of an imported loop contains the digest of the loops that it imports in turn
     parts = {
         f"{other.__module__} {other.__qualname__} ".encode()
         + Path(other.__code__.co_filename).read_bytes()

@@ -21,7 +21,7 @@ class MeglocError(Exception):
 
 
 class DataError(MeglocError):
-    """Data is missing, broken or inconsistent; names the file and, if possible, the line."""
+    """Data is missing, broken or inconsistent; the message names file and line where known."""
 
     def __init__(
         self, message: str, *, path: Path | str | None = None, line: int | None = None
@@ -40,17 +40,17 @@ class DataError(MeglocError):
 def require(
     condition: object, message: str, *, path: Path | str | None = None, line: int | None = None
 ) -> None:
-    """Raise DataError if the condition is false. Callers format the message either way."""
+    """Raise DataError if the condition is false; the message is formatted in any case."""
     if not condition:
         raise DataError(message, path=path, line=line)
 
 
 class OptionError(MeglocError):
-    """An invalid option or argument; lists the valid values."""
+    """An invalid option or argument; a message about an unknown name lists the known names."""
 
 
 def check_option(condition: object, message: str) -> None:
-    """Raise OptionError if the condition is false. Callers format the message either way."""
+    """Raise OptionError if the condition is false; the message is formatted in any case."""
     if not condition:
         raise OptionError(message)
 
@@ -64,7 +64,7 @@ class PluginError(MeglocError):
 
 
 def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> str:
-    """Return a message with the most similar known name, and all names."""
+    """Return a hint with the most similar known name, if any, and all known names."""
     names = list(known)
     similar = get_close_matches(name, names, n=1)
     return (
@@ -72,7 +72,7 @@ def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> s
     )
 
 
-# imported package: the extra that installs it
+# imported package -> extra that installs it
 _EXTRAS = {
     "torch": "torch",
     "kornia": "kornia",
@@ -83,7 +83,7 @@ _EXTRAS = {
 
 
 def missing_extra(error: BaseException) -> str | None:
-    """Return the installation advice for a failed import of an extra's package."""
+    """Return installation advice if an import failed because an extra is missing, else None."""
     package = (getattr(error, "name", None) or "").partition(".")[0]
     if not isinstance(error, ModuleNotFoundError) or package not in _EXTRAS:
         return None

@@ -1,4 +1,4 @@
-"""Names of installed plugins, without the imports that loading one takes."""
+"""Names of installed plugins, read without importing the plugins."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def entry_points(**of: str) -> Any:
 
 @cache
 def _entry_points_on(_search_path: tuple[str, ...]) -> Any:
-    """Any: Python 3.11 has another return type with the same selection."""
+    """Return type Any, because Python 3.11 and 3.12 return different classes with ``select``."""
     return metadata.entry_points()
 
 

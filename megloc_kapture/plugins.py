@@ -1,9 +1,9 @@
 """Plugin protocols; ``plugin_loading.py`` loads plugins by name.
 
-A plugin is a class registered under one of the entry-point groups below, like those of this
-package. It must be picklable, and may have ``Options``, a frozen pydantic model for its
-constructor, and ``weights() -> dict[str, str]``, the sha256 of each weight file by name, which is
-part of a stage's fingerprint and manifest.
+A plugin is a class registered under one of the entry-point groups below, as the built-in ones are.
+Its instances must be picklable. It may have ``Options``, a frozen pydantic model that is the only
+argument of its constructor, and a method ``weights() -> dict[str, str]``: the sha256 of each weight
+file by name, which becomes part of a stage's fingerprint and manifest.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RENDERED_DATASETS = "megloc_kapture.rendered_datasets"
 
 
 class PluginChoice(Options):
-    """A plugin by its registered name, and its options; a string is the name alone."""
+    """The registered name of a plugin and its options; a plain string sets the name alone."""
 
     name: str
     options: dict[str, Any] = Field(default_factory=dict)
@@ -46,7 +46,7 @@ class PluginChoice(Options):
 
 
 def chosen_by_name(known: Iterable[PluginChoice], names: Iterable[str]) -> list[dict[str, Any]]:
-    """Choose plugins by name, with their known settings."""
+    """Return the settings of the named plugins: those in ``known``, else the name alone."""
     of_name = {choice.name: choice.model_dump() for choice in known}
     return [of_name.get(name, {"name": name}) for name in names]
 
@@ -60,7 +60,7 @@ class LocalFeatureExtractor(Protocol):
     """
 
     name: str
-    """The kapture type name its features are stored under."""
+    """The kapture type name under which its features are stored."""
 
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
@@ -82,7 +82,7 @@ class GlobalFeatureExtractor(Protocol):
     """
 
     name: str
-    """The kapture type name its vectors are stored under, which identifies the model."""
+    """The kapture type name under which its vectors are stored; it identifies the model."""
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Describe an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
@@ -93,16 +93,16 @@ class GlobalFeatureExtractor(Protocol):
 class Matcher(Protocol):
     """Group ``megloc_kapture.matchers``: features of two images to matches.
 
-    An optional ``match_many(a, others)`` returns the matches of one image with each of several, in
-    order.
+    An optional ``match_many(a, others)`` returns a list: the matches of image ``a`` with each of
+    ``others``, in their order.
     """
 
     def match(
         self, a: ImageFeatures, b: ImageFeatures
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return matches int64 (K, 2), rows of a and b, each at most once, and scores (K,).
+        """Return matches int64 (K, 2), a row of a and a row of b, and their scores (K,).
 
-        Verification begins with the highest scores.
+        Each row of a or b occurs at most once. Verification begins with the highest scores.
         """
         ...
 
@@ -112,9 +112,9 @@ class Segmenter(Protocol):
     """Group ``megloc_kapture.segmenters``: image to a class per pixel."""
 
     name: str
-    """The network, for reports."""
+    """Name of the network, for reports."""
     classes: tuple[str, ...]
-    """Name of each label."""
+    """Name of the class of each label."""
     dynamic: frozenset[str]
     """Classes that are masked by default."""
 
@@ -129,7 +129,7 @@ class HypothesisView:
 
     Attributes
     ----------
-    name : of the query image.
+    name : name of the query image.
     points_px, points_world : float64 (N, 2) and (N, 3), the 2D-3D matches.
     errors_px : float64 (N,), reprojection errors; infinite behind the camera.
     inliers : bool (N,).
@@ -166,9 +166,10 @@ class DepthView:
 
     Attributes
     ----------
-    camera : of the depth sensor.
+    camera : intrinsics of the depth sensor.
     depth_m : float32 (H, W), along the optical axis; 0, negative or NaN where unknown.
-    image_from_depth : from the depth camera's frame to that of the image.
+    image_from_depth : transform from the frame of the depth camera to the frame of the image's
+        camera.
     """
 
     camera: Camera
@@ -183,7 +184,7 @@ class StereoView:
     Attributes
     ----------
     image : uint8 (H, W, 3), RGB.
-    camera : PINHOLE, of that size.
+    camera : a PINHOLE camera of the image's size.
     mask : bool (H, W), True = use; None means no mask.
     """
 
@@ -195,7 +196,7 @@ class StereoView:
 
 @dataclass(frozen=True, eq=False)
 class DepthEstimate:
-    """Depth of an image by stereo; 0 in all three where unknown.
+    """Depth of an image by stereo; all three arrays are 0 where the depth is unknown.
 
     Attributes
     ----------
@@ -221,7 +222,8 @@ class DepthEstimator(Protocol):
     ) -> DepthEstimate:
         """Estimate the depth of the reference's pixels.
 
-        Raise MeglocError for unusable views; the image then stays without depth, with the reason.
+        Raise MeglocError for unusable views; the image then gets no depth, and the reason is
+        written to ``depth.csv``.
 
         Parameters
         ----------
@@ -235,7 +237,7 @@ class RankingScene(Protocol):
     """Data for rankers and refiners, read on demand."""
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
-        """Return RGB pixels (H, W, 3) of a query image; raise DataError if it has none."""
+        """Return RGB pixels (H, W, 3) of a query image; DataError if they are missing."""
         ...
 
     def query_mask(self, name: str) -> NDArray[np.bool_] | None:
@@ -247,7 +249,7 @@ class RankingScene(Protocol):
         ...
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
-        """Return RGB pixels (H, W, 3) of a map image; raise DataError if it has none."""
+        """Return RGB pixels (H, W, 3) of a map image; DataError if they are missing."""
         ...
 
     def map_mask(self, name: str) -> NDArray[np.bool_] | None:
@@ -259,7 +261,7 @@ class RankingScene(Protocol):
         ...
 
     def map_points(self, name: str) -> NDArray[np.float64]:
-        """Return the map points observed by an image, in the world, (N, 3)."""
+        """Return the map points observed by an image, (N, 3), in the world frame."""
         ...
 
     def map_camera(self, name: str) -> Camera:
@@ -287,14 +289,14 @@ class ImageDistance(Protocol):
     """Group ``megloc_kapture.image_distances``: two aligned images to a distance."""
 
     name: str
-    """The measure, for reports."""
+    """Name of the distance measure, for reports."""
 
     def distance(
         self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> float:
-        """Return the distance of two RGB images, uint8 (H, W, 3), over valid pixels (H, W).
+        """Return the distance between two RGB images, uint8 (H, W, 3), over valid pixels (H, W).
 
-        Lower is more similar; infinite for too few valid pixels.
+        A lower distance means more similar images; it is infinite if too few pixels are valid.
         """
         ...
 
@@ -304,7 +306,7 @@ class PoseRefiner(Protocol):
     """Group ``megloc_kapture.pose_refiners``: a pose to a better one, or a reason to keep it."""
 
     name: str
-    """The method, for tables."""
+    """Name of the method, for tables."""
 
     def refine(
         self,
@@ -316,7 +318,7 @@ class PoseRefiner(Protocol):
     ) -> PoseRefinement:
         """Refine the pose of one query image.
 
-        ``references`` are map images that may overlap with it, best first.
+        ``references`` are map images that may overlap with the query image, best first.
         """
         ...
 
@@ -330,9 +332,9 @@ class DatasetAdapter(Protocol):
     """
 
     name: str
-    """The dataset, as on the command line."""
+    """Name of the dataset on the command line."""
     card: Any
-    """Its source and its layout on disk."""
+    """Source of the dataset and its layout on disk."""
 
     def check(self, root: Path) -> None:
         """Check quickly whether ``root`` can be this dataset; DataError if not."""
@@ -347,22 +349,23 @@ class DatasetAdapter(Protocol):
 class RenderedDataset(Protocol):
     """Group ``megloc_kapture.rendered_datasets``: a synthetic dataset with its true poses.
 
-    The name is that of the dataset with the same official layout, or ``synthetic`` for kapture
-    folders.
+    Register it under the name of the dataset whose official layout it writes, or under
+    ``synthetic`` if it writes kapture folders.
     """
 
     version: int
-    """Version of the files; increase it when equal options give other files."""
+    """Version of the files; increase it when equal options give different files."""
 
     @property
     def options(self) -> Options:
-        """Return all parameters of its files."""
+        """Return all parameters that determine the files."""
         ...
 
     def write(self, root: Path, work: Any) -> Mapping[str, float]:
-        """Render it below ``root``, with a ``megloc_kapture.stages.work.Work``; return counts.
+        """Render the dataset below ``root``, with a ``megloc_kapture.stages.work.Work``.
 
-        The bytes depend on the options alone. OutputError if the files cannot be written.
+        Return counts for the log. The bytes depend on the options alone. OutputError if the files
+        cannot be written.
         """
         ...
 
@@ -371,18 +374,18 @@ class RenderedDataset(Protocol):
 class StageOfAPlan(Protocol):
     """Group ``megloc_kapture.stages``: a step of a run, see ``megloc_kapture.stages.stage.Stage``.
 
-    A subclass of that class defines name, inputs, outputs and work of the stage.
+    Derive a plugin from that class; it then defines the members below.
     """
 
     name: str
-    """Name in its manifest, its command and its options, ``stages.NAME``."""
+    """Name of the stage in its manifest, its command and its options, ``stages.NAME``."""
     reads: Sequence[str]
-    """Paths in the workspace; it runs after the stages that write them."""
+    """Inputs, paths in the workspace; the stage runs after the stages that write them."""
     writes: Sequence[str]
-    """Paths in the workspace."""
+    """Outputs, paths in the workspace."""
 
     def run(self, work: Any) -> Mapping[str, float]:
-        """Run it with a ``megloc_kapture.stages.stage.StageWork``; return counts for the log."""
+        """Run the stage with a ``megloc_kapture.stages.stage.StageWork``; return counts."""
         ...
 
 

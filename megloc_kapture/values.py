@@ -29,12 +29,13 @@ CAMERA_MODEL_NUM_PARAMS: dict[str, int] = {
     "THIN_PRISM_FISHEYE": 12,
 }
 
-# these store f, cx, cy first, the others fx, fy, cx, cy
+# the parameters of these models begin with f, cx, cy; those of the other models with fx, fy, cx, cy
 ONE_FOCAL_MODELS = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
 
-# `megloc localize`, `Localizer` and `megloc serve` reject poses below it; benchmarks keep them
+# `megloc localize`, `Localizer` and `megloc serve` reject poses with a lower confidence;
+# benchmarks keep every pose
 MIN_CONFIDENCE = 0.6
 
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
@@ -55,7 +56,7 @@ def _may_be_none(annotation: Any) -> bool:
 
 
 def listed(value: Any) -> Any:
-    """Convert a name, comma-separated names or a table to a list."""
+    """Convert comma-separated names, or a single table, to a tuple."""
     if isinstance(value, str):
         return tuple(name.strip() for name in value.split(","))
     return (value,) if isinstance(value, dict) else value
@@ -69,7 +70,7 @@ class Options(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _as_typed(cls, values: Any) -> Any:
-        """Read ``none`` as None where allowed, and one name as a list."""
+        """Read ``none`` as None where allowed, and comma-separated names as a list."""
         if not isinstance(values, dict):
             return values
         read: dict[str, Any] = {}
@@ -93,8 +94,8 @@ class Camera:
     width, height : image size in pixels.
     params : the model's parameters in COLMAP's order; pixels for focal lengths and principal point.
         The centre of the first pixel is (0.5, 0.5).
-    focal_deviation : relative standard deviation of the focal length. 0: known and fixed; else it
-        is estimated with the pose.
+    focal_deviation : relative standard deviation of the focal length. 0 means that it is known and
+        fixed; otherwise the focal length is estimated with the pose.
 
     Raises
     ------
@@ -161,7 +162,8 @@ class RigidTransform:
     ) -> RigidTransform:
         """Create a transform from a rotation matrix (3, 3) and a translation (3,)."""
         (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
-        # the quaternion is the largest eigenvector of a symmetric 4x4 matrix: stable everywhere
+        # the quaternion is the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix,
+        # which is numerically stable for every rotation
         k = np.array(
             [
                 [a + e + i, 0.0, 0.0, 0.0],
@@ -222,12 +224,12 @@ class RigidTransform:
 
     def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Transform points of shape (N, 3)."""
-        # not by BLAS, whose last bits depend on the processor
+        # einsum, not BLAS, whose last bits depend on the processor
         turned = np.einsum("...j,ij->...i", points, self.rotation_matrix())
         return turned + np.array(self.translation)
 
     def center(self) -> NDArray[np.float64]:
-        """Return the camera centre in the world, (3,) float64, of a ``cam_from_world``."""
+        """Return the camera centre of a ``cam_from_world``, float64 (3,), in the world frame."""
         return np.array(self.inverse().translation)
 
 
@@ -238,9 +240,9 @@ class LocalFeatures:
     Parameters
     ----------
     keypoints_px : float32 (N, 2 or more); x, y first. The first pixel's centre is (0.5, 0.5).
-    scores : float32 (N,), higher is better; keypoints are sorted by it, best first.
+    scores : float32 (N,), higher is better; all arrays are sorted by score, best first.
     descriptors : (N, D), float32 or uint8.
-    num_masked : keypoints removed by the mask before the selection.
+    num_masked : number of keypoints that the mask removed, before the best were selected.
     """
 
     keypoints_px: NDArray[np.float32]
@@ -255,10 +257,10 @@ class ImageFeatures:
 
     Parameters
     ----------
-    keypoints_px : float32 (N, 2 or more); x, y first, then further stored columns (SuperPoint and
-        similar: the score). The first pixel's centre is (0.5, 0.5).
+    keypoints_px : float32 (N, 2 or more); x, y first, then further stored columns, for SuperPoint
+        and similar features the score. The first pixel's centre is (0.5, 0.5).
     descriptors : (N, D).
-    width, height : size of the keypoints' image in pixels.
+    width, height : size of the image in pixels.
     """
 
     keypoints_px: NDArray[np.float32]
@@ -277,8 +279,11 @@ class PoseRefinement:
     reason : reason of a rejection; empty if accepted.
     measures : numbers by name for tables, such as residuals before and after.
     covariance : as in :class:`Pose`, or None.
-    method, before, moved_m, turned_deg : name of the refiner, initial ``cam_from_world`` and the
-        displacement from it, 0 if rejected; the stage sets them.
+    method : name of the refiner.
+    before : ``cam_from_world`` before the refinement.
+    moved_m, turned_deg : displacement of the pose by the refinement, 0 if it is rejected.
+
+    The last four fields are set by :mod:`megloc_kapture.stages.pose_refinement`, not by refiners.
     """
 
     cam_from_world: RigidTransform
@@ -302,28 +307,28 @@ Fallback = Literal["none", "retrieval", "rig"]
 class LocalizationResult:
     """Outcome of localizing one query: a :class:`Pose` or a :class:`Failure`.
 
-    The rows of all tables are views of it (:mod:`megloc_kapture.io.tables`). Read from a status
-    table alone, it has neither pose nor arrays.
+    The tables of results are written from it (:mod:`megloc_kapture.io.tables`). A result that is
+    read from ``status.csv`` alone has neither pose nor arrays.
 
     Attributes
     ----------
-    cam_from_world : the pose, COLMAP axes; None without one.
-    reason : why the query has no trusted pose; empty for a pose.
-    num_matches, num_inliers : of the 2D-3D matches; of a failure, of the cluster closest to a pose.
-        None if the result comes from a pose file.
-    confidence : probability that the pose before refinement, or the rejected pose of a failure, is
-        right; None if not requested.
+    cam_from_world : the pose, COLMAP axes; None if there is no pose.
+    reason : reason why the query has no trusted pose; empty for a pose.
+    num_matches, num_inliers : numbers of 2D-3D matches and of inliers among them. For a failure,
+        those of the cluster that ranks first. None if the result comes from a pose file.
+    confidence : probability that the pose is correct: the pose before refinement, or the rejected
+        pose of a failure. None if not requested.
     candidates : matched map images of the result's cluster, best first.
-    clusters : results of all tried clusters of candidates before refinement, that of the best
-        candidate first.
-    cluster : index of the pose's cluster in ``clusters``.
+    clusters : results of all tried clusters of candidates, before refinement; the cluster of the
+        best candidate comes first.
+    cluster : index of the result's cluster in ``clusters``.
     score : ranking score of a cluster's pose, higher is better.
     refinements : results of the pose refiners, in their order.
-    remarks : skipped steps, with the missing data of query or map, and doubts about the focal
+    remarks : skipped steps, with the data that query or map lack, and doubts about the focal
         length.
-    fallback : pose that a failed query gets instead: ``retrieval``, that of its best candidate;
-        ``rig``, that of another camera through the rig.
-    seconds : by step, from feature extraction on.
+    fallback : source of the pose that a failed query gets: ``retrieval`` for the pose of its best
+        candidate, ``rig`` for the pose of another camera of its rig, moved by the rig's geometry.
+    seconds : duration of each step by name, from feature extraction on.
     name : name of the query.
     """
 
@@ -358,7 +363,8 @@ class Pose(LocalizationResult):
         query's pixels and in the map; None if not kept.
     covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit, of
         a left perturbation of ``cam_from_world``.
-    camera : with the focal length estimated with the pose, and its deviation; None if known.
+    camera : camera with the focal length that was estimated with the pose, and its deviation; None
+        if the focal length was known.
     evidence : terms of the confidence, see :mod:`megloc_kapture.localization.confidence`.
     """
 

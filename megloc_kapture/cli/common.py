@@ -1,4 +1,4 @@
-"""Flags shared by commands, named after kapture's tools, and console output."""
+"""Flags shared by commands, with the names that kapture's tools use, and console output."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _LINE_EVERY_S = 10.0
 
 
 class Console:
-    """Progress bars on a terminal, plain lines elsewhere; results go to standard output."""
+    """Progress bars on a terminal, else plain lines; results go to standard output."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self.quiet = quiet
@@ -72,7 +72,7 @@ class Console:
             self.result(f"{words:44s}{figure:>8}")
 
     def track(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-        """Yield the items with a progress bar."""
+        """Yield the items while showing the progress."""
         if self.quiet:
             yield from items
         elif self.terminal:
@@ -102,7 +102,7 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
 
 def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:
     """Return a map's kapture folder; a COLMAP model is imported into the user's cache."""
-    # the stages take long to import
+    # importing the stages is slow
     from megloc_kapture.datasets.colmap_map import is_colmap
     from megloc_kapture.pipeline.map_making import kapture_of
 
@@ -185,7 +185,7 @@ class Working(Common):
     def staged(
         self, output: Path, kind: str, *, force: bool, adds: bool = False
     ) -> Iterator[tuple[Path, Work]]:
-        """Yield a staging folder, published as ``output``, and the executor."""
+        """Yield a staging folder, whose content moves to ``output`` on success, and the Work."""
         with (
             staged_output(output, kind=kind, force=force, adds=adds) as out,
             self.working(out) as work,
@@ -194,7 +194,7 @@ class Working(Common):
 
     @contextmanager
     def working_in(self, workspace: Workspace) -> Iterator[Work]:
-        """Open the executor for a locked workspace."""
+        """Lock the workspace and yield the Work of a run in it."""
         with workspace.lock(), self.working(workspace.root) as work:
             yield work
 
@@ -204,7 +204,7 @@ class Linked:
     """Flags of commands that read kapture folders."""
 
     allow_links_below: Folders = ()
-    """Accepted for older scripts: links in kapture folders are always followed."""
+    """No effect; accepted for older scripts. Links in kapture folders are always followed."""
 
     @property
     def features_dirs(self) -> tuple[Path, ...]:
@@ -215,7 +215,7 @@ class Linked:
 
     def kapture_map(self, root: Path) -> KaptureFolder:
         """Open the kapture folder of a map or workspace."""
-        # the workspace takes long to import
+        # importing the workspace is slow
         from megloc_kapture.pipeline.plan import map_of_workspace
 
         return self.kapture(map_of_workspace(root))
@@ -226,7 +226,7 @@ class Reading(Linked):
     """Flags of commands that read features of kapture folders."""
 
     features_dir: Folders = ()
-    """Folder of features outside the kapture folders; may be repeated."""
+    """Folder with features outside the kapture folders; may be repeated."""
 
     @property
     def features_dirs(self) -> tuple[Path, ...]:
@@ -288,7 +288,7 @@ class Deciding(Choosing):
 
     min_confidence: float | None = None
     """Reject poses with a lower confidence (0 to 1); 0 keeps every pose, for challenges, where a
-    wrong pose costs nothing. If omitted, 0.6."""
+    wrong pose costs nothing. If omitted, 0.6, or 0 for megloc eval."""
 
     def assignments(self) -> tuple[str, ...]:
         if self.min_confidence is None:

@@ -128,11 +128,11 @@ class Import(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Synth(Working):
-    """Render a dataset: a synthetic world as kapture, or a small twin in an official layout."""
+    """Render a dataset: a synthetic world as kapture, or a small twin of a public dataset."""
 
     dataset: tyro.conf.Positional[str] = SYNTHETIC
-    """synthetic: a world as plain kapture; aachen, robotcar, 4seasons, inloc: a twin of the
-    dataset."""
+    """synthetic: a world as kapture folders; aachen, robotcar, 4seasons, inloc: a twin of this
+    dataset in its official layout."""
     output: Output
     """Output folder."""
     seed: int = 0
@@ -158,8 +158,8 @@ class Export(Common):
     """Write a map, localized queries or both for COLMAP, nerfstudio, evo and viewers."""
 
     format: tyro.conf.Positional[ExportFormat]
-    """colmap: a model; nerfstudio: transforms.json; tum: a trajectory, as evo reads it; ply: points
-    and camera frusta."""
+    """colmap: a model; nerfstudio: transforms.json; tum: a trajectory, for evo; ply: points and
+    camera frusta."""
     input: Annotated[Path | None, tyro.conf.arg(aliases=["-i"])] = None
     """Kapture map, or a kapture folder of images with poses."""
     query: Path | None = None
@@ -167,7 +167,7 @@ class Export(Common):
     output: Output
     """Folder for colmap and nerfstudio, else a file."""
     sensor: str | None = None
-    """Export images of this camera only; tum needs it if several cameras share timestamps."""
+    """Export only the images of this camera; required for tum if cameras share timestamps."""
     undistort: bool = False
     """For colmap: write undistorted images/ and their model with PINHOLE cameras to sparse/0, the
     layout that programs for Gaussian splatting read."""
@@ -196,8 +196,8 @@ class View(Linked, Common):
     result: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RESULT")] = None
     """Localized kapture folder, pose file or COLMAP model."""
     gt: Path | None = None
-    """True poses, in the same formats: queries are coloured by their error and joined to their true
-    pose."""
+    """True poses, in the same formats as RESULT. Queries are then coloured by their error and
+    joined to their true poses."""
     output: Output = Path("view.html")
     """File to write."""
     open: bool = False

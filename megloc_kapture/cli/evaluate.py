@@ -34,8 +34,8 @@ class Evaluate(Common):
     input: Inputs = ()
     """Localized kapture folder, pose file or COLMAP model; may be repeated to compare results."""
     gt: Path | None = None
-    """True poses: kapture folder, pose file or COLMAP model; without it, only statistics that need
-    no true poses."""
+    """True poses: kapture folder, pose file or COLMAP model. If omitted, only statistics that need
+    no true poses are computed."""
     dataset: str | None = None
     """Dataset whose thresholds, conditions and pools apply: aachen, robotcar, 4seasons, inloc, ...;
     if omitted, the workspace's protocol."""
@@ -47,8 +47,8 @@ class Evaluate(Common):
     """Align the poses with the truth first, as evo does: sim3 with scale, for maps in an arbitrary
     frame and scale; se3 without scale. The alignment ignores outliers."""
     side_tables: Path | None = None
-    """The workspace's megloc/ folder (conditions, protocol); if omitted, the one next to the truth
-    or the results."""
+    """The workspace's megloc/ folder (conditions, protocol); if omitted, the megloc/ folder next to
+    the true poses or the results."""
     map: Path | None = None
     """Kapture folder of the map, for the report; if omitted, the workspace's."""
     force: Force = False
@@ -111,7 +111,8 @@ class Submit(Common):
     output: Output
     """Pose file; for 4seasons a folder, with one file per relocalization file."""
     side_tables: Path | None = None
-    """The megloc/ folder of the imported dataset; if omitted, the one next to the result."""
+    """The megloc/ folder of the imported dataset; if omitted, the megloc/ folder next to the
+    result."""
     from_rig: bool = False
     """Derive missing poses from another camera of the rig at the same timestamp."""
     force: Overwrite = False
@@ -167,7 +168,7 @@ def summary(counts: Mapping[str, int]) -> str:
     return ", ".join([text, *filter(None, parts)])
 
 
-# same exit status as user errors
+# exit status if the check finds problems, the same as that of user errors
 PROBLEMS_FOUND = 2
 _RUNS = Path("runs")
 
@@ -182,8 +183,8 @@ class Check(Common):
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Pose file; for 4seasons also the folder of all pose files."""
     data: Path | None = None
-    """Imported dataset or workspace to compare with; if omitted, runs/DATASET-* if only one
-    exists."""
+    """Imported dataset or workspace to compare with; if omitted, the workspace runs/DATASET-*, if
+    it is the only one."""
     json: bool = False
     """Print the result as JSON."""
 
@@ -215,7 +216,7 @@ class Check(Common):
     def _workspace(self, console: Console) -> Path | None:
         from megloc_kapture.pipeline.datasets import dataset_names
 
-        # e.g. runs/synthetic-aachen-classic is not of dataset synthetic
+        # runs/synthetic-aachen-classic, for example, is not a workspace of the dataset synthetic
         longer = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
         workspaces = [
             path

@@ -33,7 +33,7 @@ BELOW_RECALL = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Eval(Deciding, Working):
-    """Run all stages on a dataset; stages that are up to date are kept."""
+    """Run all stages on a dataset; results that are up to date are kept."""
 
     dataset: tyro.conf.Positional[str] = "synthetic-aachen"
     """aachen, robotcar, 4seasons, inloc; synthetic-X: a rendered twin of one of them; kapture: any
@@ -46,8 +46,8 @@ class Eval(Deciding, Working):
     """Workspace folder; if omitted, runs/DATASET-PRESET, for kapture folders
     runs/kapture-ROOT-PRESET."""
     submissions: Path | None = None
-    """Folder for a copy of the pose file and its provenance, without overwriting those of another
-    result. If omitted, submissions/, or none with --workspace."""
+    """Folder for a copy of the pose file and its provenance; the files of another result are not
+    overwritten. If omitted, submissions/; with --workspace no copy is made."""
     import_option: Texts = ()
     """An option of the dataset, as for megloc import --set: key=value (version=1.0,
     location_prior=false); may be repeated."""
@@ -58,15 +58,15 @@ class Eval(Deciding, Working):
     query_prefix: str = ""
     """Put the queries into a folder of this name, if they share names with map images."""
     from_stage: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """Run this stage and its successors again; use earlier stages as they are."""
+    """Run this stage and all later ones again; use the results of earlier stages as they are."""
     until: str | None = None
     """Stop after this stage."""
     dry_run: bool = False
     """List the stages that would run, and why."""
     explain: bool = False
-    """List all stages, on or off, with the deciding options; run nothing."""
+    """List all stages, on or off, with the options that decide; run nothing."""
     fail_below: float | None = None
-    """Exit with 3 if recall at the last threshold (0 to 1) is lower."""
+    """Exit with 3 if the recall (0 to 1) at the last threshold is lower."""
     force: Overwrite = False
     """Use a non-empty workspace, or that of another root; accept map poses that contradict the
     matches of their images."""
@@ -117,7 +117,8 @@ class Eval(Deciding, Working):
             pose_file = run.submission_below(workspace.root, workspace.path(SIDE_TABLES))
             self._hand_in(console, pose_file, submissions)
             doubtful = done["submission"].counts.get("doubtful", 0)
-            if doubtful and run.source.adapter is not None:  # only challenges have a server
+            # only challenges, which have an adapter, have an evaluation server
+            if doubtful and run.source.adapter is not None:
                 console.say(
                     f"{doubtful:,} poses had too little confidence for the pose file; a server "
                     "counts a missing pose as wrong: --set localization.min_confidence=0 keeps "
@@ -130,7 +131,7 @@ class Eval(Deciding, Working):
 
     def _check_truth(self, choice: DatasetChoice) -> None:
         if self.fail_below is not None and not 0.0 <= self.fail_below <= 1.0:
-            raise OptionError(f"--fail-below is a share between 0 and 1, got {self.fail_below:g}")
+            raise OptionError(f"--fail-below is a recall from 0 to 1, got {self.fail_below:g}")
         if self.fail_below is None:
             return
         if self.until not in (None, "evaluation"):
@@ -174,7 +175,7 @@ class Eval(Deciding, Working):
 
 
 def shown(path: Path) -> str:
-    """Return the shortest path from the current folder."""
+    """Return the path relative to the current folder, if it lies below; else unchanged."""
     try:
         return str(path.relative_to(Path.cwd()))
     except ValueError:

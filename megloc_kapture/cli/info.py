@@ -54,7 +54,7 @@ _QUANTILES = (0.1, 0.5, 0.9)
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Reading, Common):
-    """Describe a kapture folder, and how it can be used as a map."""
+    """Describe a kapture folder and its use as a map."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
     """Kapture folder, or a COLMAP model."""
@@ -104,7 +104,7 @@ class Info(Reading, Common):
 
 def describe_content(console: Console, folder: KaptureFolder) -> None:
     data = folder.read()
-    # includes uncalibrated cameras
+    # counts uncalibrated cameras too
     devices = (data.sensors[device] for _, device in data.records_camera)
     models = Counter("".join(sensor.params[:1]) or UNKNOWN_CAMERA for sensor in devices)
     cameras = ", ".join(f"{count} {model}" for model, count in sorted(models.items()))
@@ -114,7 +114,7 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
     line(console, "images", f"{images} ({cameras}), {len(data.poses())} with a pose")
     if data.records_depth:
         joined = len(depth_records(data))
-        # depth sensors in the camera's rig
+        # a depth map belongs to an image if a rig links their sensors
         use = "" if joined else ": ignored, as no rig links their sensor to a camera"
         line(console, "depth maps", f"{len(data.records_depth)}, of {joined} images{use}")
     for kind in ("keypoints", "descriptors", "global_features"):
@@ -250,7 +250,7 @@ def _is_below(key: str, asked: str) -> bool:
 
 
 def _plugins() -> dict[str, list[str]]:
-    """Return the plugin groups of each configurable plugin."""
+    """Return plugin name -> groups in which it is registered, for groups with options."""
     groups_of: dict[str, list[str]] = {VLAD: []}
     for group in (
         *(LOCAL_FEATURES, GLOBAL_FEATURES, MATCHERS, POSE_RANKERS, POSE_REFINERS),

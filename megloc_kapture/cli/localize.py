@@ -56,8 +56,8 @@ class Localize(Reading, Deciding, Common):
     input: Input
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     query: Path | None = None
-    """Kapture folder with the queries, and with their features if the map's type cannot be
-    extracted."""
+    """Kapture folder with the queries, and with their features if no extractor for the map's type
+    of features is installed."""
     images: tuple[Path, ...] = ()
     """Instead of --query: photographs, videos, or folders of them. Focal lengths come from EXIF or
     a guess and are estimated with the poses."""
@@ -139,12 +139,12 @@ class Localize(Reading, Deciding, Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(Reading, Deciding, Common):
-    """Localize images sent over HTTP in a kapture map; has a page for photographs."""
+    """Localize images that clients send over HTTP in a kapture map; has a page for photographs."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     host: str = "127.0.0.1"
-    """Address to listen on; any other than loopback needs --token-file."""
+    """Address to listen on; an address other than loopback needs --token-file."""
     port: int = 8000
     """Port to listen on; 0: any free port."""
     token_file: Path | None = None
@@ -152,7 +152,7 @@ class Serve(Reading, Deciding, Common):
     threads: int | None = None
     """Number of images localized in parallel; if omitted, all cores."""
     max_waiting: int = 32
-    """Number of images that may wait; more are refused (503)."""
+    """Number of images that may wait; further images are rejected (503)."""
     max_mb: float = 20.0
     """Largest request, megabytes."""
     max_megapixels: float = 32.0

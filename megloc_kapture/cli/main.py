@@ -19,10 +19,11 @@ from typing import Annotated, Any
 
 from megloc_kapture.errors import MeglocError, OptionError, missing_extra, suggestion
 
-DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+# an internal error exits with 1
+DONE, USER_ERROR, INTERRUPTED, TERMINATED = 0, 2, 130, 143
 
 
-# module:class by name, so that only the requested command is imported
+# command -> "module:class", so that only the module of the requested command is imported
 COMMANDS = {
     "eval": "evaluate_dataset:Eval",
     "import": "conversion:Import",
@@ -79,7 +80,7 @@ def command_class(name: str) -> type[Any]:
 
 
 def _parser(given: Sequence[str]) -> Any:
-    """Return the type that tyro parses; only the given command has flags."""
+    """Return the type that tyro parses; only the command in ``given`` has its flags."""
     from dataclasses import make_dataclass
 
     import tyro
@@ -92,7 +93,7 @@ def _parser(given: Sequence[str]) -> Any:
         raise OptionError(f"unknown command {given[0]!r}; {known}")
     annotated: Any = Annotated  # mypy does not follow runtime types
     completes = given[:1] and given[0].startswith("--tyro-")  # shell completion needs all commands
-    texts = {name: f"Run the stage {name}, of another package." for name in stages}
+    texts = {name: f"Run the stage {name} of a third-party package." for name in stages}
     texts |= _help_texts()
     commands = []
     for name in [*COMMANDS, *(name for name in stages if name not in COMMANDS)]:
@@ -109,9 +110,10 @@ def _say_stopped(how: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; exit with 0, 1 (internal error), 2 (user error), 3, 130 (Ctrl-C) or 143.
+    """Run a command and exit with its status; ``arguments`` default to those of the process.
 
-    ``arguments`` default to those of the process.
+    0 means success, 1 an internal error, 2 a user error, 3 a recall below ``eval --fail-below``,
+    130 Ctrl-C and 143 SIGTERM.
     """
     given = sys.argv[1:] if arguments is None else arguments
     debug = False
@@ -135,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _say_stopped("interrupted")
         status = INTERRUPTED
     except SystemExit as end:
-        # printed here, not by the signal handler, which may have interrupted another print
+        # not printed by the signal handler, which may have interrupted another print
         if end.code == TERMINATED:
             _say_stopped("terminated")
         raise
@@ -147,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _tell(error: BaseException, debug: bool) -> int:
     """Print the lines of a user error and return the exit status; reraise internal errors."""
     if isinstance(error, BrokenPipeError):
-        # broken pipe: the flush at exit must not complain
+        # the flush of standard output at exit must not raise the error again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     if isinstance(error, MeglocError):

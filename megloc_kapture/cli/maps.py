@@ -47,17 +47,17 @@ from megloc_kapture.stages.stage import LOCALIZED, MAP, count_text
 
 @dataclass(frozen=True, kw_only=True)
 class MapPhotographs(Choosing, Working):
-    """Make a map of photographs without poses; stages that are up to date are kept."""
+    """Make a map from photographs without poses; results that are up to date are kept."""
 
     images: tyro.conf.Positional[tuple[Path, ...]]
     """Photographs, videos, or folders of them; or a kapture folder of images without poses."""
     output: Output
-    """Workspace, which all commands accept as a map; its folder map/ is the kapture map."""
+    """Workspace; all commands accept it as a map. Its folder map/ is the kapture map."""
     mapper: Mapper = "incremental"
     """COLMAP's mapper."""
     scale: tuple[str, ...] = ()
-    """Scale: gps, from the positions in EXIF; or IMAGE IMAGE METRES, two photographs and the
-    distance between their cameras. If omitted, arbitrary units."""
+    """Source of the scale. gps: positions in EXIF; IMAGE IMAGE METRES: two photographs and the
+    distance between their cameras. If omitted, the scale is arbitrary."""
     camera: str | None = None
     """Fixed camera of all images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS
     as in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
@@ -84,8 +84,8 @@ class MapPhotographs(Choosing, Working):
 class RefineMap(Reading, StageCommand):
     """Remove points and observations that a map's images or depth maps contradict.
 
-    --set refinement.uncertainty.max_robust_sigmas=2.5 also rejects uncertain points; if omitted,
-    the preset's choice.
+    --set refinement.uncertainty.max_robust_sigmas=2.5 also rejects uncertain points; if it is
+    omitted, the preset decides.
     """
 
     input: Input
@@ -106,7 +106,7 @@ class RefineMap(Reading, StageCommand):
 
 
 def report_lines(root: Path) -> list[str]:
-    """Tabulate the observations and points that refinement removed; empty without refinement."""
+    """Tabulate the points and observations that refinement removed; empty without refinement."""
     path = root / "reconstruction" / REPORT_FILE
     if not path.is_file():
         return []
@@ -138,7 +138,7 @@ class Densify(Reading, StageCommand):
     by: str | None = None
     """Estimator: sweep, colmap or a plugin; if omitted, sweep."""
     points: bool = False
-    """Lift keypoints without a point through the depth, with their uncertainty."""
+    """Also create 3D points for keypoints that have none, from their depth, with uncertainty."""
     fuse: Path | None = None
     """Write the fused point cloud to this PLY file."""
     force: Force = False

@@ -122,12 +122,13 @@ class ExtractLocal(Linked, StageCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Match(Reading, StageCommand):
-    """Match image pairs; verify matches by known poses within a map, else by a two-view model."""
+    """Match image pairs and verify the matches: by the known poses of map images, or by two-view
+    geometry for queries."""
 
     input: Input
     """Kapture folder of the map."""
     query: Path | None = None
-    """Kapture folder of the queries; without it the pairs are within the map."""
+    """Kapture folder of the queries; if omitted, the pairs are of map images."""
     pairs: Path
     """Pairs file."""
     output: Output
@@ -144,7 +145,7 @@ class Match(Reading, StageCommand):
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
         options = self.options(changes)
-        # --matcher applies even if the preset has another one for this type
+        # --matcher applies even if the preset has another matcher for this type of features
         chosen = options.matching if self.matcher else options.matching_of(local_type)
         matcher = load_chosen(MATCHERS, chosen, options.placement)
         first, verification = mapping, options.verify_mapping()
@@ -209,7 +210,7 @@ class ExtractGlobal(Reading, StageCommand):
     input: Input
     """Kapture folder of the map; VLAD is trained on its descriptors."""
     query: Folders = ()
-    """Kapture folder of queries to describe as well; may be repeated."""
+    """Kapture folder of queries, whose images are described too; may be repeated."""
     output: Output
     """Features folder: global_features/T/global_features."""
     features: tuple[str, ...] = ()
@@ -254,9 +255,9 @@ class PairsMapping(Reading, StageCommand):
     topk: int | None = None
     """Number of most similar images per image (retrieval)."""
     covisibility_map: Path | None = None
-    """Kapture map of the same images whose points define covisibility; if omitted, the input."""
+    """Kapture map of the same images; its points define covisibility. If omitted, the input."""
     features: tuple[str, ...] = ()
-    """Types of global features, several are fused; required if several exist."""
+    """Types of global features; several types are fused. Required if several exist."""
     fusion: FusionMethod | None = None
     """Fusion of several types; if omitted, the preset's."""
     force: Overwrite = False
@@ -298,7 +299,7 @@ class PairsQuery(Reading, StageCommand):
     topk: int | None = None
     """Number of most similar map images per query."""
     features: tuple[str, ...] = ()
-    """Types of global features, several are fused; required if several exist."""
+    """Types of global features; several types are fused. Required if several exist."""
     fusion: FusionMethod | None = None
     """Fusion of several types; if omitted, the preset's."""
     exhaustive: bool = False
@@ -306,12 +307,13 @@ class PairsQuery(Reading, StageCommand):
     rerank: int | None = None
     """Rerank the candidates by local matches and keep this many."""
     rerank_by: Literal["coverage", "verified", "matches"] = "coverage"
-    """Score of a candidate: its matches, its verified matches (two-view geometry), or coverage
-    (verified matches at keypoints that no better candidate matches)."""
+    """Score of a candidate. matches: number of matches; verified: number of matches that a two-view
+    geometry verifies; coverage: number of verified matches at query keypoints that no better
+    candidate matches."""
     local_features: tuple[str, ...] = ()
     """Types of local features to rerank by; if omitted, all types of map and queries."""
     matches_dir: Path | None = None
-    """Folder for the matches of reranking, which later steps use."""
+    """Folder for the matches computed for reranking; later steps use them."""
     force: Overwrite = False
     """Overwrite the pairs file and the folder of matches."""
 
@@ -373,7 +375,7 @@ def _retrieval(
     fusion: FusionMethod | None,
     options: PipelineOptions,
 ) -> Retrieval:
-    """Return the global-feature types to compare, with the preset's weights."""
+    """Return the types of global features to compare, and their fusion by the options."""
     types = tuple(only_type(mapping, "global_features", name) for name in asked or (None,))
     how = options.fusion
     if fusion is not None:
@@ -432,15 +434,15 @@ class Preprocess(Linked, Computing, Working):
     bottom_share: Texts = ()
     """Mask the bottom of images: CAMERA=0.2; CAMERA is a sensor id or a pattern of image names."""
     polygon: Texts = ()
-    """Mask a polygon: CAMERA="x,y x,y x,y", corners in shares of width and height."""
+    """Mask a polygon: CAMERA="x,y x,y x,y", corners as fractions of width and height."""
     mask_file: Texts = ()
-    """Mask the pixels that are 0 in an image of the camera's size: CAMERA=FILE."""
+    """Mask the pixels that are 0 in this image file, which has the camera's size: CAMERA=FILE."""
     unchanging: bool = False
     """Detect and mask the static ego-vehicle region of each camera."""
     sequence: Folders = ()
     """Additional images of the same cameras (kapture folder) for --unchanging; may be repeated."""
     user_masks: Path | None = None
-    """Folder of masks IMAGE.png, 0 for ignored pixels."""
+    """Folder of masks IMAGE.png; pixels of value 0 are masked."""
     set: Texts = ()
     """Change another option: key=value (upscale); may be repeated."""
     force: Force = False
@@ -486,7 +488,7 @@ class Preprocess(Linked, Computing, Working):
 
 
 def _by_camera(flag: str, texts: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield camera and value of each ``CAMERA=VALUE``, split at the last sign."""
+    """Yield camera and value of each ``CAMERA=VALUE``, split at the last ``=``."""
     for text in texts:
         camera, _, value = text.rpartition("=")
         check_option(camera and value, f"{flag} takes CAMERA=VALUE, got {text!r}")

@@ -41,7 +41,7 @@ class Train(Linked, Common):
     """matcher: SuperGlue for frozen features; descriptor: descriptors of a frozen detector's
     keypoints."""
     input: Inputs = ()
-    """Kapture folder with poses and depth; may be repeated."""
+    """Kapture folder with poses and depth to train on; may be repeated."""
     photographs: Folders = ()
     """Folder of images to train on under random homographies; may be repeated."""
     held_out: Folders = ()
@@ -100,7 +100,7 @@ class TrainField(Linked, Common):
     steps: int = 4000
     """Number of training steps."""
     minutes: float | None = None
-    """Stop after this many minutes; results are reproducible only without it."""
+    """Stop after this many minutes; results are not reproducible then."""
     max_side: int = 320
     """Longer side of the training images, px; larger images are reduced."""
     held_out_every: int = 8
@@ -116,7 +116,7 @@ class TrainField(Linked, Common):
     compiled: bool = False
     """Use torch.compile: faster on a GPU after minutes of compilation; needs a C compiler."""
     force: Overwrite = False
-    """Write into a non-empty folder; start again."""
+    """Write into a non-empty folder; start the training again."""
 
     def run(self, console: Console) -> None:
         from pydantic import ValidationError
@@ -169,9 +169,10 @@ class Render(Linked, Working):
     camera: str | None = None
     """For --pose: MODEL,WIDTH,HEIGHT,PARAMETERS as in COLMAP."""
     depth: Path | None = None
-    """For --pose: depth file, 16-bit PNG in thousandths of the map's unit, 0 where empty."""
+    """For --pose: write the depth to this file, a 16-bit PNG in thousandths of the map's unit, 0
+    where nothing is rendered."""
     along: Path | None = None
-    """Kapture folder, such as a result: render all its images with poses, with depth."""
+    """Kapture folder, such as a result: render view and depth of each of its images with a pose."""
     between: Path | None = None
     """Map: render views halfway between neighbouring cameras, with depth, as additional map images
     (merge them with kapture_merge); views with less than half of their pixels on the scene are
@@ -179,7 +180,7 @@ class Render(Linked, Working):
     max_side: int | None = None
     """For --along and --between: longer side of the renderings, px; larger cameras are reduced."""
     appearance: str | None = None
-    """Training image whose light is used; if omitted, the mean of all."""
+    """Training image whose lighting is used; if omitted, the mean lighting of all."""
     force: Overwrite = False
     """Overwrite a file, or write into a non-empty folder."""
 

@@ -1,4 +1,4 @@
-"""``megloc weights`` and ``doctor``: network weights with licences, and environment checks."""
+"""``megloc weights`` and ``doctor``: weights of networks, their licences; environment checks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ WRONG_FILES = 2
 
 @dataclass(frozen=True, kw_only=True)
 class List(Common):
-    """List all networks with file, size, licence and state."""
+    """List all networks with the file, size, licence and state of their weights."""
 
     def run(self, console: Console) -> None:
         import pandas as pd  # slow import
@@ -53,7 +53,7 @@ class List(Common):
         console.result(as_text(pd.DataFrame([_row(weights) for weights in registry().values()])))
         console.result(f"\nfolder of weights: {weights_folder()}")
         console.result("(!) megloc weights fetch asks for consent: --accept-licence")
-        console.result("* not confirmed on the original file:")
+        console.result("* facts that are not confirmed on the original file:")
         for weights in registry().values():
             if weights.unverified:
                 console.result(f"  {weights.name}: {weights.unverified}")
@@ -66,7 +66,7 @@ class Fetch(Common):
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
     """Names of networks, as listed."""
     preset: str | None = None
-    """All missing weights of this preset."""
+    """Fetch all missing weights of this preset."""
     accept_licence: bool = False
     """Agree to a licence that does not plainly allow commercial use."""
     force: Overwrite = False
@@ -158,7 +158,7 @@ class Check(Common):
     """Check the existing files: sha256 if known, and safe loading."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
-    """Names of networks, as listed; if omitted, all with a file."""
+    """Names of networks, as listed; if omitted, all networks that have a file."""
 
     def run(self, console: Console) -> int:
         """Return 2 if a file is wrong."""
@@ -263,7 +263,7 @@ def _row(weights: Weights) -> dict[str, str]:
     )
     return {
         "name": f"{weights.name} *" if weights.unverified else weights.name,
-        "what for": weights.purpose,
+        "purpose": weights.purpose,
         "file": " | ".join(f.name for f in weights.files),
         "size": "?" if file.size is None else f"{file.size / 1e6:.2f} MB",
         "licence": weights.licence if weights.commercial else f"{weights.licence} (!)",
@@ -274,7 +274,7 @@ def _row(weights: Weights) -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
-    """Check the environment: versions, known-bad combinations, GPU, weights."""
+    """Check the environment: versions, incompatible packages, GPU, weights."""
 
     def run(self, console: Console) -> None:
         """Print the environment and exit with 2 if something is wrong."""
@@ -300,7 +300,7 @@ def gpu() -> str:
 
 
 def find_problems() -> list[str]:
-    """Return known-bad package combinations with remedies."""
+    """Return installed combinations of packages that are known to fail, with remedies."""
     problems = []
     torch, vision = installed_version("torch"), installed_version("torchvision")
     if vision and torch and "+cpu" in torch:

@@ -1,7 +1,7 @@
 """A COLMAP model as a kapture map: cameras, rigs, poses, points, features; images are linked.
 
-Features and descriptors come from the model's database. Without a database, SIFT is extracted
-again from the images and the observations move to the new keypoints.
+Keypoints and descriptors come from the model's database. Without a database, SIFT is extracted
+again from the images, and observations are assigned to the new keypoints.
 """
 
 from __future__ import annotations
@@ -69,10 +69,11 @@ def is_colmap(path: Path) -> bool:
 def find_colmap(
     path: Path, *, images: Path | None = None, database: Path | None = None
 ) -> ColmapFolders:
-    """Find the parts of a reconstruction from the folder of its model or its workspace.
+    """Find the parts of a reconstruction, given the folder of its model or its workspace.
 
-    A workspace has ``sparse/0`` or ``sparse``, ``images`` and ``database.db``; the latter two may
-    also lie next to the model. Arguments ``images`` and ``database`` replace the search.
+    A workspace has ``sparse/0`` or ``sparse``, ``images`` and ``database.db``; ``images`` and
+    ``database.db`` may also lie in or next to the model's folder. The arguments ``images`` and
+    ``database`` replace the search.
     """
     models = _models(path)
     require(
@@ -106,7 +107,7 @@ def _models(path: Path) -> list[Path]:
 
 
 def _holds_model(folder: Path) -> bool:
-    # a missing file is reported later
+    # two of the three files suffice here; a missing file is reported later
     return any(sum((folder / n).is_file() for n in ns) > 1 for ns in (BINARY_FILES, TEXT_FILES))
 
 
@@ -116,9 +117,10 @@ class ColmapReconstruction:
 
     Attributes
     ----------
-    data : sensors, rigs, records and poses. Timestamps are frame ids for rigs, else image ids.
-    names : kapture name by model name.
-    scales : (x, y) scale by kapture name, for images of another size than in the model.
+    data : sensors, rigs, records and poses. Timestamps are frame ids, or image ids if the model
+        has no frames or a frame has two images of a camera.
+    names : name in the model -> name in kapture.
+    scales : name in kapture -> (x, y) scale, for images of another size than in the model.
     """
 
     source: ColmapFolders
@@ -143,7 +145,7 @@ class ColmapReconstruction:
                         f"{message}; give their folder with `megloc import colmap --images`",
                         path=source.images,
                     )
-                    # the database has the features
+                # with a database, images are not needed for features
                 _log.warning("%s: %s", source.images, message)
         scaled = _scaled_cameras(source, model)
         scales = {
@@ -156,7 +158,7 @@ class ColmapReconstruction:
 
     @property
     def renamed(self) -> dict[str, str]:
-        """Return model names by kapture name, if they differ."""
+        """Return name in kapture -> name in the model, for names that differ."""
         return {new: old for old, new in self.names.items() if new != old}
 
     def write_images(self, output: Path) -> None:
@@ -173,8 +175,9 @@ class ColmapReconstruction:
     def write_map(self, output: Path, *, work: Work = HERE) -> dict[str, float] | None:
         """Write the map into the empty folder ``output`` and return counts for the log.
 
-        Without descriptors in a database, ``found_again`` is the share of observations with a
-        re-extracted keypoint. None, with a warning, if the model's features are not available.
+        Without descriptors in a database, the count ``share_found_again`` is the fraction of
+        observations with a newly extracted keypoint. Return None, with a warning, if the model has
+        no points or its keypoints are not found again.
         """
         source = self.source
         local_type = None
@@ -208,7 +211,7 @@ class ColmapReconstruction:
         with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
             reference, images, sift = (Path(scratch) / n for n in ("reference", "images", _SIFT))
             self._write_reference(reference, keypoints_type=_SIFT)
-            # separate folder: the model's keypoints would take precedence
+            # a separate kapture: in the reference, the model's keypoints would take precedence
             self.write_images(images)
             mapping = KaptureFolder(images, features_dirs=[sift])
             extractor = load_plugin(LOCAL_FEATURES, _SIFT)
@@ -220,7 +223,7 @@ class ColmapReconstruction:
                     raise
                 _log.warning(_MAPPED_AGAIN, self.source.model, error.message)
                 return None
-        self.link_images(output)  # links pointed to the scratch folder
+        self.link_images(output)  # the links point to the scratch folder, which is gone
         return counts
 
     def _write_reference(self, output: Path, **features: Any) -> dict[str, float]:
@@ -257,7 +260,7 @@ def _scaled_cameras(source: ColmapFolders, model: ColmapModel) -> dict[int, Came
 
 
 def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
-    """Return kapture names by model names; characters that kapture's files reserve become ``_``."""
+    """Return name in the model -> name in kapture; reserved characters become ``_``."""
     names: dict[str, str] = {}
     taken: dict[str, str] = {}
     for image in model.images:

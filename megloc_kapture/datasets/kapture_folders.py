@@ -69,7 +69,7 @@ def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
 def checked_folders(
     root: Path, query_prefix: str = ""
 ) -> tuple[KaptureFolder, KaptureData, KaptureFolder, KaptureData]:
-    """Return the checked folders of map and queries, with cameras fitted to the image sizes."""
+    """Return the checked folders of map and queries, with cameras scaled to the image sizes."""
     root = check_root(root)
     mapping, query = KaptureFolder(root / MAPPING), KaptureFolder(root / QUERY)
     map_data, query_data = with_cameras_of_images(mapping), with_cameras_of_images(query)
@@ -102,7 +102,7 @@ def import_kapture_folders(
     rename = prefixed(query_prefix)
     write_sensors(output / MAPPING, map_data)
     link_images(mapping.root, output / MAPPING)
-    # stages must not see poses of a query folder
+    # written without poses, which the stages must not see
     write_sensors(output / QUERY, _renamed(query_data, rename, is_truth=False))
     link_images(query.root, output / QUERY, below=query_prefix)
     truth = 0
@@ -178,8 +178,8 @@ def cameras_of_images(
 ) -> tuple[dict[Key, Camera], list[DataError]]:
     """Compare cameras with the image sizes in the files' headers; unreadable files are skipped.
 
-    Returns cameras scaled to their images, if these agree on one scale factor up to rounding, and
-    an error for each image of any other size.
+    Return the scaled cameras and the errors. A camera is scaled if the sizes of its images include
+    a single multiple of its size, up to rounding. Every image of another size gives an error.
     """
     of_camera: dict[Key, dict[tuple[int, int], list[Path]]] = {}
     for key, path in images:
@@ -201,7 +201,7 @@ def cameras_of_images(
 
 
 def is_scaled(camera: Camera, size: tuple[int, int]) -> bool:
-    """Return whether an image size is the camera's times one factor, up to rounding."""
+    """Return whether an image has the camera's aspect ratio, up to rounding of its size."""
     width, height = size
     difference = abs(width * camera.height - height * camera.width)
     return difference <= max(width, height, camera.width, camera.height)
@@ -270,7 +270,7 @@ def _renamed_tables(
     for name, group in tables.groups.items():
         if name in of_query:
             groups[rename(name)] = group
-            # a name in map and queries keeps its group for both
+        # an image name that occurs in map and queries has its group in both
         if name in of_map or name not in of_query:
             groups[name] = group
     return replace(

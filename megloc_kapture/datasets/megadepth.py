@@ -45,9 +45,9 @@ def _texts(value: Any) -> tuple[str, ...]:
 class MegaDepthOptions(Options):
     """Options of importing MegaDepth."""
 
-    # 5001 is a number to the command line
+    # the command line parses 5001 as a number
     scenes: Annotated[tuple[str, ...], BeforeValidator(_texts)] = Field(
-        default=(), description="scene numbers; none: all"
+        default=(), description="numbers of the scenes to import; if empty, all"
     )
 
 
@@ -77,7 +77,7 @@ def import_megadepth(
 
 
 def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
-    """Read a depth map (H, W), 0 if unknown; return None for images with ordinal depth only."""
+    """Read a depth map (H, W), 0 where unknown; return None if there is only ordinal depth."""
     import h5py
 
     with reading(path, "an HDF5 file with 'depth'"), h5py.File(path, "r") as file:

@@ -1,7 +1,7 @@
 """NVM files of VisualSFM, as exported by COLMAP and published by challenges.
 
-Cameras have centres instead of translations, and distortion of the opposite sign to COLMAP's. The
-file has neither image sizes nor principal points.
+Cameras have centres instead of translations. The sign of the distortion is opposite to COLMAP's.
+The file has neither image sizes nor principal points.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _ROWS = 50_000  # points parsed at once
 class NvmModel:
     """A model of C images; the image ids of ``points`` are positions in ``names``.
 
-    Rotations ``quat_wxyz`` (C, 4) are from world to camera, ``centers`` (C, 3) in the world;
-    ``k_colmap`` (C,) is SIMPLE_RADIAL distortion.
+    Rotations ``quat_wxyz`` (C, 4) are from world to camera, camera ``centers`` (C, 3) are in the
+    world frame. ``k_colmap`` (C,) is the distortion parameter of SIMPLE_RADIAL.
     """
 
     names: tuple[str, ...]
@@ -46,7 +46,10 @@ class NvmModel:
 
 
 def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
-    """Read the only model of a file; an extra list of unregistered images is ignored."""
+    """Read the only model of a file.
+
+    A second model without points, which lists unregistered images, is ignored.
+    """
     with (
         reading(path, "an NVM file"),
         named(path),
@@ -81,7 +84,7 @@ def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDA
 
 
 def _read_points(rows: Iterator[str], count: int, images: int, with_points: bool) -> SparsePoints:
-    """Read rows: X Y Z R G B, number of observations, then image feature x y for each."""
+    """Read rows of X Y Z R G B, number of observations, and image, feature, x, y for each."""
     parts = []
     while count:
         lines = list(islice(rows, min(_ROWS, count)))

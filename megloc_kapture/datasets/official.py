@@ -1,7 +1,7 @@
-"""A dataset read from its official layout by an adapter, and its kapture folders.
+"""A dataset that an adapter read from its official layout, and its kapture folders.
 
-:func:`write_official` writes ``mapping/``, ``query/``, optional ``query_gt/``, ``megloc/`` and
-optional ``reference/`` (the dataset's model); images are linked.
+:func:`write_official` writes ``mapping/``, ``query/``, ``megloc/`` and, if available, ``query_gt/``
+and ``reference/`` (the dataset's model); images are linked.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MISSING_SHOWN = 5
 
 
 class DatasetCard(Options):
-    """Address and layout of a dataset, for messages; ``folders`` are usual root names."""
+    """Address and layout of a dataset, for messages; ``folders`` are usual names of its root."""
 
     title: str
     published_at: str
@@ -72,7 +72,7 @@ class Count:
 
 @dataclass
 class Missing:
-    """Missing files, collected to be reported together."""
+    """Missing files, collected so that a single message reports all."""
 
     root: Path
     files: list[Path] = field(default_factory=list)
@@ -115,7 +115,7 @@ class OfficialDataset(SideTables):
     """A dataset with its tables; poses are in the local frame.
 
     ``links`` maps folders below ``records_data`` to folders of the dataset (``""`` is
-    ``records_data`` itself), ``image_files`` maps other images to files. ``reference`` reads the
+    ``records_data`` itself); ``image_files`` maps single images to files. ``reference`` reads the
     image names and points of the dataset's model. ``write_more`` writes further files (depth maps)
     below the output folder.
     """
@@ -178,8 +178,8 @@ def read_ground_truth(
 ) -> tuple[KaptureData | None, dict[str, ImageGroup]]:
     """Read true poses (in the local frame) and groups from ``<root>/ground_truth``, if present.
 
-    ``query/`` in it is a kapture folder with poses in the official frame and the image names of the
-    import, ``megloc/groups.csv`` has the conditions.
+    Its ``query/`` is a kapture folder with poses in the official frame and with the image names of
+    the import. Its ``megloc/groups.csv`` has the conditions.
     """
     folder = root / GROUND_TRUTH
     if not (folder / QUERY).exists():
@@ -197,7 +197,7 @@ def read_ground_truth(
 
 
 def with_poses(data: KaptureData, poses: Mapping[tuple[int, str], RigidTransform]) -> KaptureData:
-    """Replace the trajectories of ``data``, by (timestamp, device)."""
+    """Return ``data`` with these poses, by (timestamp, device), and without depth records."""
     return replace(data, trajectories=dict(poses), records_depth={})
 
 
@@ -205,7 +205,7 @@ def last_part(image: str) -> str:
     return PurePosixPath(image).name
 
 
-# kapture's guide to converting Aachen puts the folders next to the official files
+# kapture's guide to converting Aachen puts them into kapture/ next to the official files
 _PARENTS = (".", "kapture")
 _FOLDERS = ("mapping", "query_day", "query_night", "query")
 _FOLDERS_OF_LOCATIONS = ("[0-9][0-9]/mapping", "[0-9][0-9]/query")
@@ -213,7 +213,7 @@ _FOLDERS_OF_LOCATIONS = ("[0-9][0-9]/mapping", "[0-9][0-9]/query")
 
 @dataclass(frozen=True, slots=True)
 class KaptureImage:
-    """An image with its kapture data; ``locations`` are ``001`` and so on."""
+    """An image with its kapture data; ``locations`` are numbers of three digits, as ``001``."""
 
     name: str
     file: Path
@@ -227,14 +227,14 @@ class KaptureImage:
 
 @dataclass(frozen=True)
 class KaptureForm:
-    """The kapture folders of a dataset; the first is the map."""
+    """The kapture folders of a dataset; those of the map, named ``mapping``, come first."""
 
     root: Path
     folders: tuple[Path, ...]
 
     @classmethod
     def find(cls, root: Path, *, with_locations: bool = False) -> KaptureForm | None:
-        """Find the folders below a root; return None without a map."""
+        """Find the kapture folders below a root; return None if no folder is a map."""
         patterns = _FOLDERS_OF_LOCATIONS if with_locations else _FOLDERS
         for parent in (Path(root) / name for name in _PARENTS):
             candidates = [
@@ -246,7 +246,10 @@ class KaptureForm:
         return None
 
     def read(self, missing: Missing) -> list[KaptureImage]:
-        """Read the existing images by folder and time; check one image size per camera."""
+        """Read the existing images, sorted by folder and time.
+
+        The size of one image per camera and folder is checked.
+        """
         images: dict[str, KaptureImage] = {}
         for path in self.folders:
             folder = KaptureFolder(path)
@@ -279,7 +282,7 @@ class KaptureForm:
         return list(images.values())
 
     def rig(self) -> dict[str, RigidTransform]:
-        """Return ``sensor_from_rig`` by sensor id; the first folder wins."""
+        """Return ``sensor_from_rig`` by sensor id, from the first folder that has the sensor."""
         poses: dict[str, RigidTransform] = {}
         for path in self.folders:
             for members in KaptureFolder(path).read().rigs.values():

@@ -1,7 +1,7 @@
-"""A dataset's sparse model as a kapture map, as used by hloc and others; COLMAP's databases.
+"""A dataset's sparse model as a kapture map, as hloc and others use it, and COLMAP databases.
 
 pycolmap opens databases for writing: it adds tables to the user's file and fails in read-only
-folders. Here they are opened as ``immutable``, which creates no files even in WAL mode.
+folders. Here databases are opened as ``immutable``, which creates no files even in WAL mode.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 
-# ids of COLMAP's feature/types.h with the names of our extractors or weights; COLMAP stores all
-# descriptors as bytes, those of networks are float32
+# feature type of COLMAP's feature/types.h -> name of the extractor or weights in this package, and
+# dtype; COLMAP stores all descriptors as bytes, but those of networks are float32
 _SIFT, _UNDEFINED = 0, -1
 _TYPES = {
     _UNDEFINED: ("colmap-undefined", "u1"),
@@ -89,7 +89,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             if any(column[1] == "type" for column in columns):
                 rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
                 kinds = {int(kind) for (kind,) in rows}
-            else:  # before version 4: SIFT, or imported features
+            else:  # older versions of COLMAP store no type: SIFT, or imported features
                 rows = self._rows("SELECT DISTINCT cols FROM descriptors WHERE rows > 0")
                 kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for (size,) in rows}
         types = [_TYPES.get(kind) or (f"colmap-{kind}", "u1") for kind in kinds]
@@ -127,12 +127,12 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         return DataError(message, path=self.path)
 
 
-# features of the same model differ by rounding only
+# keypoints of a model and of its database differ only by rounding
 _MAX_SHIFT_PX = 1.0
 
 
 def published_database(path: Path | None, remarks: list[str]) -> Path | None:
-    """Return the feature database of a published model; if it is missing, None and a remark."""
+    """Return the feature database of a published model; if it is missing, None, adding a remark."""
     if path is not None and path.is_file():
         return path
     remarks.append(
@@ -161,15 +161,15 @@ def write_reference_map(
 ) -> dict[str, int]:
     """Write a sparse model as a kapture map: sensors, poses, keypoints, points, observations.
 
-    Row i of ``points3d.txt`` is point i of the model; images without a record are omitted. Without
-    a database, keypoints are the observed ones, renumbered in the order of their ids; with a
-    database, all of its keypoints and descriptors are written.
+    Row i of ``points3d.txt`` is point i of the model; images without a record are omitted. With a
+    database, all of its keypoints and descriptors are written. Without a database, only observed
+    keypoints are written, renumbered in the order of their ids.
 
     Parameters
     ----------
     image_names : name in ``data`` of each image of the model, in model order.
     database : COLMAP database with the names of ``image_names``, up to their suffixes.
-    database_names : database names that differ from ``image_names``.
+    database_names : names in the database, by image, that differ from ``image_names``.
     scales : (x, y) scale of images whose camera in ``data`` has another size than in the model.
     """
     write_sensors(output, data)
@@ -183,7 +183,8 @@ def write_reference_map(
     ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
     keypoint_ids = np.full(len(order), -1, np.int32)  # -1: omitted observation
     new_ids = np.zeros(len(image_names), np.int32)
-    lengths, sources = dict[str, int](), dict[str, str]()  # keypoints, and names in the database
+    # number of keypoints, and name in the database, by image
+    lengths, sources = dict[str, int](), dict[str, str]()
     with ExitStack() as stack:
         source = None
         if database is not None:
@@ -268,7 +269,8 @@ def _write_descriptors(
     """Write descriptors of images with ``lengths`` keypoints; ``sources`` are the stored names."""
     (kind, dtype), size = feature_type, 0
     writer: FeatureWriter | None = None
-    for name in sorted(lengths, key=lambda name: lengths[name] == 0):  # sizes before empty files
+    # images without keypoints come last: their empty files need the descriptor size of the others
+    for name in sorted(lengths, key=lambda name: lengths[name] == 0):
         rows = database.descriptors(sources[name], dtype) if name in sources else None
         if rows is not None:
             size = size or rows.shape[1]

@@ -1,6 +1,6 @@
 """COLMAP through pycolmap: cameras, databases, models, triangulation with known poses.
 
-pycolmap's changing names and pitfalls (docs/architecture.md) stay in the modules of ``io``.
+Only the modules of ``io`` deal with pycolmap's changing names and pitfalls (docs/architecture.md).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from megloc_kapture.errors import DataError, OutputError, require
 from megloc_kapture.io.files import TEMPORARY, output_error
 from megloc_kapture.values import Camera, Options, RigidTransform
 
+# minimum number of residuals for several threads, so high that COLMAP always uses a single thread
 NEVER = 2**31 - 1
 
 
@@ -35,7 +36,7 @@ def load_pycolmap() -> Any:
     before = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
-    # importing it replaces the SIGTERM handler: a terminated run would end with a stack trace
+    # importing pycolmap replaces the SIGTERM handler; a terminated run would print a stack trace
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
     pycolmap.logging.minloglevel = 2  # hide INFO lines
@@ -44,7 +45,7 @@ def load_pycolmap() -> Any:
 
 @contextmanager
 def quiet_stderr() -> Iterator[None]:
-    # COLMAP writes progress to the file descriptor at every log level
+    # COLMAP writes progress to file descriptor 2 at every log level
     if os.environ.get("MEGLOC_COLMAP_LOG"):
         yield
         return
@@ -92,7 +93,7 @@ def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[n
 def undistorted_pinhole(camera: Camera) -> Camera:
     """Return the PINHOLE camera of COLMAP's undistorted image, with the same focal lengths.
 
-    No pixel lies outside the distorted image.
+    All its pixels lie inside the distorted image.
     """
     pycolmap = load_pycolmap()
     options = pycolmap.UndistortCameraOptions()
@@ -102,7 +103,7 @@ def undistorted_pinhole(camera: Camera) -> Camera:
 
 
 def focal_from_exif(jpeg: bytes) -> float | None:
-    """Return COLMAP's focal length in pixels from the EXIF of a JPEG file; None without one."""
+    """Return COLMAP's focal length in pixels from the EXIF of a JPEG file, or None."""
     pycolmap = load_pycolmap()
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         path = Path(folder) / "blank.jpg"
@@ -120,8 +121,8 @@ def focal_from_matches(
 ) -> float | None:
     """Estimate the focal length in pixels of an otherwise known camera by P4Pf in a RANSAC.
 
-    Matches (N, 2), (N, 3) that are not finite are ignored. Return None if
-    no pose has enough inliers.
+    Matches of ``points_px`` (N, 2) and ``points`` (N, 3) that are not finite are ignored. Return
+    None if no pose has enough inliers.
     """
     usable = np.isfinite(points_px).all(axis=1) & np.isfinite(points).all(axis=1)
     if np.count_nonzero(usable) < 4:
@@ -163,10 +164,10 @@ class MapImage:
 
 @dataclass(frozen=True, eq=False)
 class TriangulatedPoints:
-    """Points float64 (N, 3) in the world frame, mean reprojection errors and observations.
+    """Points float64 (N, 3) in the world frame, mean reprojection errors (N,) and observations.
 
-    ``point_ids``, ``image_ids`` and ``keypoint_ids`` int64 (O,) are rows of points, images and
-    keypoints, sorted in this order.
+    Each observation refers to a point, an image and a keypoint of this image by row, int64 (O,)
+    each. Observations are sorted by point, then image, then keypoint.
     """
 
     xyz: NDArray[np.float64]
@@ -213,9 +214,9 @@ def triangulate(
         reconstruction = _posed_reconstruction(recentred, cameras, camera_ids)
         pipeline = pycolmap.IncrementalPipelineOptions()
         pipeline.num_threads = num_threads
-        # threads sum many residuals in varying order, which changes the last bits
+        # several threads sum residuals in varying order, which changes the last bits
         pipeline.ba_min_num_residuals_for_cpu_multi_threading = NEVER
-        # used for long tracks only, without a known effect on points
+        # COLMAP uses the seeds for long tracks only, without a known effect on points
         pipeline.random_seed = pipeline.triangulation.random_seed = 0
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
         pipeline.triangulation.min_angle = _MIN_ANGLE_DEG
@@ -237,7 +238,7 @@ def database_folder(
     num_keypoints: Sequence[int],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
 ) -> Iterator[str]:
-    """Yield a folder for a database after checking free space: COLMAP aborts on a full disk."""
+    """Yield a folder for a database; OutputError without enough space, where COLMAP would abort."""
     place = tempfile.gettempdir() if scratch is None else scratch
     # matches are written twice, keypoints as float32; the rest is SQLite and its journal
     needed = 16 * sum(map(len, matches.values())) + 8 * sum(num_keypoints)
@@ -283,8 +284,9 @@ def write_database(
 ) -> None:
     """Write a COLMAP database in which every camera is its own rig.
 
-    ``images`` are name, camera id and keypoints (N, 2), numbered from 1; ``matches`` are (M, 2)
-    keypoint rows of pairs (i, j) of images, all inliers unless ``geometry`` verifies them.
+    ``images`` are name, camera id and keypoints (N, 2); their ids count from 1. ``matches`` are
+    (M, 2) keypoint rows of pairs (i, j) of rows of ``images``. They are stored as inliers, unless
+    ``geometry`` verifies them.
     """
     pycolmap = load_pycolmap()
     database = pycolmap.Database.open(str(path))
@@ -341,7 +343,7 @@ def _posed_reconstruction(
 
 
 def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPoints:
-    # COLMAP's point order depends on its threads; sort by track
+    # sorted by track, because COLMAP's order of points depends on its threads
     tracks = [
         (sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements), point)
         for _, point in sorted(reconstruction.points3D.items())
@@ -365,9 +367,10 @@ def write_model(
     xyz: NDArray[np.float64],
     colours: NDArray[np.floating],
 ) -> None:
-    """Write a binary COLMAP model, numbered by row from 1, in which every camera is its own rig.
+    """Write a binary COLMAP model in which every camera is its own rig; ids count from 1.
 
-    ``observed`` holds rows of keypoints and of points by image; unobserved points are written too.
+    ``observed`` holds, for each image, the rows of its keypoints and of the points they observe.
+    Unobserved points are written too.
     """
     pycolmap = load_pycolmap()
     model = _posed_reconstruction(images, *_cameras_of(images))

@@ -1,9 +1,9 @@
 """SIFT, structure from motion and dense stereo of COLMAP, through pycolmap.
 
 The mappers are COLMAP's incremental one (Schoenberger and Frahm, CVPR 2016) and GLOMAP (Pan et al.,
-ECCV 2024). A stereo workspace holds ``images/NAME``, ``sparse/`` and
-``stereo/{depth_maps,normal_maps}/NAME.KIND.bin``: ``W&H&C&``, then float32 by channels. Its images
-are undistorted pinholes.
+ECCV 2024). A stereo workspace holds undistorted ``images/NAME``, a model with PINHOLE cameras in
+``sparse/``, and maps in ``stereo/{depth_maps,normal_maps}/NAME.KIND.bin``: the text ``W&H&C&``,
+then float32 by channels.
 """
 
 from __future__ import annotations
@@ -39,12 +39,14 @@ from megloc_kapture.values import Camera, RigidTransform
 Mapper = Literal["incremental", "global"]
 _FOLDERS = {"depth": "depth_maps", "normal": "normal_maps"}
 MIN_IMAGES = 3
-# RANSAC may find fewer inliers by chance; COLMAP needs as many to register an image
+# points that two images must share to be connected, and that a model must have: RANSAC may find
+# fewer inliers by chance, and COLMAP needs as many inliers to register an image
 _MIN_POINTS = 30
-# a photograph with another zoom, or a crop: its separately estimated focal length differs from the
-# median by more than this, and its reprojection error falls to at most this share
+# a photograph was taken with another zoom, or is a crop, if its separately estimated focal length
+# differs from the median by more than _OTHER_ZOOM (difference of logarithms) and its reprojection
+# error falls below _SMALLER_ERROR times that with the shared camera
 _OTHER_ZOOM, _SMALLER_ERROR = 0.08, 0.95
-# median motion below which two images are the same
+# two images are identical if the median motion of their matches is smaller
 _SAME_PX = 0.5
 
 
@@ -59,7 +61,8 @@ def extract_sift(
 
     COLMAP keeps whole scale levels, coarsest first, up to the one that exceeds ``max_keypoints``.
     Return keypoints float32 (N, 4): x, y (first pixel's centre at (0.5, 0.5)), scale in px and
-    orientation in radians, fine scales first; and RootSIFT descriptors uint8 (N, 128), times 512.
+    orientation in radians, fine scales first; and RootSIFT descriptors uint8 (N, 128), scaled by
+    512.
     """
     pycolmap = load_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
@@ -68,7 +71,7 @@ def extract_sift(
     options.sift.first_octave = first_octave
     options.sift.peak_threshold = peak_threshold
     bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image)).clone_as_grey()
-    # not cached: an extractor holds a pyramid, which two threads would share
+    # not cached, because threads would share the pyramid of the extractor
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     detected, descriptors = extractor.extract(bitmap)
     rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in detected]
@@ -83,8 +86,8 @@ def extract_sift(
 class Photograph:
     """An image without a pose; images of one sensor share an estimated camera.
 
-    Keypoints have the first pixel's centre at (0.5, 0.5). A ``doubtful`` image belongs to its
-    sensor by its size alone.
+    The first pixel's centre is at (0.5, 0.5). A ``doubtful`` image was assigned to its sensor by
+    its size alone.
     """
 
     name: str
@@ -96,9 +99,10 @@ class Photograph:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A connected reconstruction in its own world frame, without scale.
+    """A connected reconstruction in its own world frame, of unknown scale.
 
-    Images whose camera differs from their sensor's share one named after the first of them.
+    ``sensors`` maps images to the names in ``cameras``. Images whose camera differs from that of
+    their sensor share a new camera, named after the first of these images.
     """
 
     cameras: dict[str, Camera]
@@ -119,9 +123,9 @@ def reconstruct(
 ) -> list[Model]:
     """Estimate poses and cameras from matches; return connected models, the largest first.
 
-    ``matches`` are (M, 2) keypoint rows of pairs (i, j) of photographs. Connected images share 30
-    points. Doubtful images whose focal lengths differ get separate cameras, and the reconstruction
-    is repeated. It runs in one thread to be deterministic.
+    ``matches`` are (M, 2) keypoint rows of pairs (i, j) of photographs. Two images are connected if
+    they share at least 30 points. Doubtful images with another focal length get separate cameras,
+    and the reconstruction is repeated. COLMAP runs in one thread to be deterministic.
     """
     pycolmap = load_pycolmap()
     sensors = sorted({photograph.sensor for photograph in photographs})
@@ -194,7 +198,7 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
         options.ba_min_num_residuals_for_cpu_multi_threading = NEVER
         options.min_model_size = MIN_IMAGES
         options.extract_colors = False
-        # takes minutes where two scenes are mixed
+        # this fallback takes minutes if photographs of two scenes are mixed
         options.structure_less_registration_fallback = False
         if known_cameras:
             options.constant_cameras = {camera.camera_id for camera in cameras}
@@ -206,7 +210,8 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
 def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, str]:
     """Map doubtful images with another focal length to the first image of their group.
 
-    Poses and points absorb a wrong camera; bundle adjustment with a camera per image reveals it.
+    Poses and points absorb the error of a shared camera; bundle adjustment with a separate camera
+    per image reveals it.
     """
     pycolmap = load_pycolmap()
     images = [reconstruction.images[number] for number in sorted(reconstruction.reg_image_ids())]
@@ -267,12 +272,12 @@ def _errors_px(reconstruction: Any) -> dict[int, float]:
 
 
 def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]:
-    """Split a reconstruction into connected models; connected images share 30 points.
+    """Split a reconstruction into models whose images are connected by 30 or more shared points.
 
     The mappers accept the few wrong matches that join unrelated parts. ``sensors`` are in the order
     of the camera ids of the pycolmap.Reconstruction.
     """
-    reconstruction.update_point_3d_errors()  # the global mapper's are those of rays
+    reconstruction.update_point_3d_errors()  # the global mapper stores errors of rays, not pixels
     points = [point for _, point in sorted(reconstruction.points3D.items())]
     images = [reconstruction.images[number] for number in sorted(reconstruction.reg_image_ids())]
     if not images or not points:
@@ -310,7 +315,7 @@ def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]
 
 
 def _why_none(seen: Sequence[tuple[Any, float]]) -> str:
-    """Explain the failure from the two-view geometries and median motions of verified pairs."""
+    """Explain the failure by the two-view geometries and median motions of verified pairs."""
     if not seen:
         return "no two photographs show enough of the same things to be matched"
     if all(moved_px < _SAME_PX for _, moved_px in seen):
@@ -346,7 +351,7 @@ def write_workspace(
 ) -> None:
     """Write images and model of a stereo workspace (PINHOLE cameras) to the empty folder ``root``.
 
-    Fusion selects the neighbours of an image by shared points.
+    The model has points, because COLMAP's fusion selects neighbours of an image by shared points.
     """
     for image, shown in zip(images, pixels, strict=True):
         path = root / "images" / image.name
@@ -362,12 +367,12 @@ def write_workspace(
 def run_patch_match(
     root: Path, name: str, sources: Sequence[str], depth_range_m: tuple[float, float]
 ) -> None:
-    """Estimate the depth of one image of a workspace by comparison with ``sources``; needs CUDA."""
+    """Estimate the depth of one image of a workspace from its ``sources``; needs CUDA."""
     pycolmap = load_pycolmap()
     text = f"{name}\n{', '.join(sources)}\n"
     write_bytes(root / "stereo" / "patch-match.cfg", text.encode())
     options = pycolmap.PatchMatchOptions()
-    # geometric consistency is checked later, for all estimators alike
+    # the stage checks geometric consistency later, for all estimators alike
     options.geom_consistency = False
     options.depth_min, options.depth_max = depth_range_m
     pycolmap.patch_match_stereo(str(root), options=options)

@@ -34,7 +34,7 @@ RecordT = TypeVar("RecordT")
 def read_csv_table(
     path: Path | str, columns: Sequence[str], *, optional: Sequence[str] = ()
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield ``(line, row)`` for each non-empty row, without missing ``optional`` columns."""
+    """Yield ``(line, row)`` for each non-empty row; ``optional`` columns may be missing."""
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     try:
         header = next(reader, [])
@@ -56,7 +56,7 @@ def read_csv_table(
 def write_csv_table(
     path: Path | str, columns: Sequence[str], rows: Iterable[Iterable[object]]
 ) -> None:
-    """Write rows of text, numbers, tuples of text, poses, and empty cells for None and NaN."""
+    """Write rows of text, numbers, tuples of text and poses; None and NaN give empty cells."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
@@ -78,7 +78,7 @@ def _cell(value: object) -> str:
         return ""
     if isinstance(value, RigidTransform):
         return " ".join(repr(float(v)) for v in (*value.quat_wxyz, *value.translation))
-    # kapture forbids the comma in image names
+    # a comma is a safe separator, because kapture forbids it in image names
     return ",".join(value) if isinstance(value, tuple) else str(value)
 
 
@@ -99,7 +99,7 @@ ImageName = Annotated[str, AfterValidator(check_relative)]
 Names = Annotated[tuple[str, ...], _split(",")]
 Parts = Annotated[tuple[str, ...], _split(";")]
 PoseCell = Annotated[RigidTransform, BeforeValidator(_pose)]
-# empty cells
+# types of cells that may be empty
 OrNone = BeforeValidator(lambda text: text or None)
 OrNan = Annotated[float, BeforeValidator(lambda text: text or "nan")]
 
@@ -121,7 +121,7 @@ def read_records(
 ) -> list[RecordT]:
     """Read a table whose columns are the parameters of ``record``, a dataclass or a function.
 
-    Older files may lack the ``optional`` columns. With ``missing_ok``, a missing file is empty.
+    Older files may lack the ``optional`` columns. With ``missing_ok``, a missing file has no rows.
     """
     if missing_ok and not Path(path).exists():
         return []

@@ -1,8 +1,8 @@
-"""The ``megloc/`` folder of a workspace: tables of a dataset that kapture does not cover.
+"""The ``megloc/`` folder of a workspace: facts about a dataset that kapture has no tables for.
 
 ==================  ================================================================================
 groups.csv          image, condition, frame, location, scored: one row per image
-priors.csv          query, permitted: group or map image that the query may be matched with
+priors.csv          query, permitted: map image, location or frame to match the query with
 names.csv           image, name: names of scored queries in the pose file, in the challenge's order
 relocalization.csv  file, reference, query: pairs of an MLAD challenge; ``file`` names the pose file
 unreadable.csv      image, reason: queries left out because their image cannot be used
@@ -11,8 +11,9 @@ world.json          ``official_from_local``, unit and position on earth of the l
 protocol.json       thresholds, format and names of the pose file, conditions and their pools
 ==================  ================================================================================
 
-Datasets write them; stages and evaluation read them. A missing file means its default: no rows, one
-metric frame without offset, the default protocol.
+Imports of datasets and the mapping of photographs write these files; stages and evaluation read
+them. A missing table has no rows. Without world.json, the local frame is the official frame, in
+metres. Without protocol.json, the defaults of :class:`Protocol` hold.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ RELOCALIZATION_FILE = "relocalization.csv"
 UNREADABLE_FILE = "unreadable.csv"
 UNREGISTERED_FILE = "unregistered.csv"
 NOWHERE_FILE = "nowhere.txt"
-# units of the local frame; a map of unknown scale uses its own
+# units of the local frame; NO_METRES is that of a map of unknown scale
 METRES, NO_METRES = "m", "units"
 
 # a quaternion's length may differ from 1 by less than this; it is then normalised
@@ -58,7 +59,10 @@ PoseFileFormat = Literal["ltvl", "mlad"]
 
 
 class ImageGroup(Options):
-    """Condition (as reported: ``day``, ``night-rain``), frame and location of one image."""
+    """Condition in reports (``day``, ``night-rain``), coordinate frame and location of one image.
+
+    Queries that are not ``scored`` are missing from the pose file and from the recall.
+    """
 
     condition: str = ""
     frame: str = ""
@@ -86,9 +90,10 @@ class SimilarityTransform(Options):
 
 
 class World(Options):
-    """The local frame of a workspace, recentred at import if the official one is far from zero.
+    """The local frame of a workspace and its relation to the dataset's official frame.
 
-    Poses are submitted and evaluated in the official frame.
+    The import recentres datasets whose official coordinates are far from zero. Poses are submitted
+    and evaluated in the official frame.
     """
 
     official_from_local: SimilarityTransform = SimilarityTransform()
@@ -100,7 +105,7 @@ class World(Options):
     )
 
     def pose_in_official(self, cam_from_local: RigidTransform) -> RigidTransform:
-        """Convert ``cam_from_local`` to ``cam_from_official``, lengths included."""
+        """Convert ``cam_from_local`` to ``cam_from_official``, with lengths in official units."""
         similarity = self.official_from_local
         local_from_official = similarity.rotation().inverse()
         rotation = RigidTransform(cam_from_local.quat_wxyz, (0.0, 0.0, 0.0)) @ local_from_official
@@ -126,12 +131,15 @@ class Protocol(Options):
 
     Parameters
     ----------
-    thresholds : pairs (position in metres, angle in degrees or null), upper limits for both errors.
+    thresholds : pairs (position in metres, angle in degrees or null): upper limits of the errors.
     pose_file : ``ltvl``, one file of absolute poses (visuallocalization.net), or ``mlad``, one
         file per relocalization file with poses relative to reference keyframes.
-    pose_file_stem : STEM of the server's ``STEM_eval_METHOD.txt``; empty means ``dataset``.
-    truth : owner of the ground truth where it is not published.
-    pools : name -> conditions reported together, as "day" pools dawn and noon.
+    pose_file_names : the pose file has ``full`` image names, or ``basename`` without folders.
+    pose_file_stem : STEM of the server's ``STEM_eval_METHOD.txt``; if empty, the value of
+        ``dataset``.
+    truth : owner of the ground truth, if it is not published.
+    conditions : order of the conditions in reports.
+    pools : name -> conditions that are reported together, for example "day" for dawn and noon.
     """
 
     dataset: str = Field(default="kapture", min_length=1)
@@ -158,7 +166,7 @@ class RelocalizationPair:
     query: ImageName
 
 
-# columns of the tables, in the order of the parameters
+# the parameters of these functions are the columns of the tables, in this order
 
 
 def _group(
@@ -173,7 +181,7 @@ def _prior(query: ImageName, permitted: str) -> tuple[str, str]:
 
 def _name(
     image: ImageName,
-    name: Annotated[str, Field(pattern=r"^\S+$")],  # one word of a pose file
+    name: Annotated[str, Field(pattern=r"^\S+$")],  # a field of the blank-separated pose file
 ) -> tuple[str, str]:
     return image, name
 
@@ -184,7 +192,7 @@ def _unreadable(image: ImageName, reason: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideTables:
-    """The tables that describe a dataset; an empty one has no file."""
+    """The tables that describe a dataset; an empty table has no file."""
 
     protocol: Protocol
     groups: Mapping[str, ImageGroup] = field(default_factory=dict)
@@ -265,7 +273,7 @@ def write_unreadable(
 
 
 def tables_of(root: Path | str) -> Path | None:
-    """Return the table folder of a kapture folder, or of its parent workspace."""
+    """Return the ``megloc/`` folder in a kapture folder or its parent; None if both lack it."""
     root = Path(root)
     for folder in (root, root.resolve().parent):
         if (folder / SIDE_TABLES / PROTOCOL_FILE).is_file():
@@ -274,13 +282,13 @@ def tables_of(root: Path | str) -> Path | None:
 
 
 def write_unit(root: Path, unit: str) -> None:
-    """Write tables for a kapture folder whose unit is not metres."""
+    """Write the tables that state the unit of a kapture folder."""
     write_protocol(root / SIDE_TABLES, Protocol())
     write_world(root / SIDE_TABLES, World(unit=unit))
 
 
 def unit_of(root: Path | str) -> str:
-    """Return the unit of a map or of results in it: m or :data:`NO_METRES`."""
+    """Return the unit of a map, or of results localized in a map: m or :data:`NO_METRES`."""
     tables = tables_of(root)
     return METRES if tables is None else read_world(tables).unit
 
@@ -318,7 +326,7 @@ def write_protocol(folder: Path | str, protocol: Protocol) -> None:
 
 
 def read_nowhere(truth: Path | str) -> tuple[str, ...]:
-    """Read ``nowhere.txt`` next to the ground truth: queries that show nothing of the map."""
+    """Read ``nowhere.txt`` next to the true poses: queries that show nothing of the map."""
     path = Path(truth) / NOWHERE_FILE
     if not path.is_file():
         return ()

@@ -1,7 +1,7 @@
 """File access: checked paths, atomic writes, links, JSON.
 
-Files are written under a hidden temporary name and renamed, so that a killed run leaves the old
-state or the new one; fsync would be too slow for thousands of small files.
+Files are written under a hidden temporary name and renamed, so that a killed run leaves either the
+old file or the new one. They are not synced: fsync is too slow for thousands of small files.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
     except OSError as error:
         reason = "cannot read" if error.strerror or not what else f"not {what}, or broken"
         raise DataError(f"{reason}: {_text_of(error)}", path=path) from error
-    except Exception as error:  # libraries raise many kinds on broken files
+    except Exception as error:  # libraries raise many kinds of errors for broken files
         if not what or isinstance(error, MeglocError):
             raise
         raise DataError(f"not {what}, or broken: {_text_of(error)}", path=path) from error
 
 
 def _text_of(error: Exception) -> str:
-    """Return the first sentence of an error, without addresses in memory, which vary."""
+    """Return the first sentence of an error, without memory addresses, which vary."""
     text = getattr(error, "strerror", None) or str(error)
     return " ".join(re.sub(r"<\S+ object at \S+>|[.;]\s.*", "", text, flags=re.S).split())
 
@@ -97,7 +97,7 @@ def has_control_characters(text: str) -> bool:
 
 @lru_cache(maxsize=1 << 12)
 def check_relative(text: str) -> str:
-    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise DataError."""
+    """Return ``text`` if it is a plain relative path (``a/b.jpg``); raise DataError if not."""
     require(text, "empty path")
     if "\\" in text or has_control_characters(text):
         raise DataError(f"backslash or control character in path {text!r}")
@@ -110,7 +110,7 @@ def check_relative(text: str) -> str:
 
 
 def check_component(text: str) -> str:
-    """Return ``text`` if it is a valid type name: one folder name and one CSV field."""
+    """Return ``text`` if it is a valid type name: a single folder name and a single CSV field."""
     check_relative(text)
     if "/" in text or "," in text or text != text.strip():
         raise DataError(f"{text!r} cannot be a type name (slash, comma or space at the end)")
@@ -134,7 +134,7 @@ def temporary_name() -> str:
 
 
 def clear_temporary(folder: Path, *, nested: bool = True) -> None:
-    """Remove unfinished files in a folder that has no other writers, or also ``nested`` ones."""
+    """Remove unfinished files from a folder without other writers and, if ``nested``, below it."""
     find = folder.rglob if nested else folder.glob
     for path in list(find(f"{TEMPORARY}*")):
         remove(path)
@@ -169,14 +169,14 @@ def writing(path: Path | str) -> Iterator[None]:
 @contextlib.contextmanager
 def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block succeeds; creates parent folders."""
-    # not a Path: creating one takes as long as writing a small file
+    # no Path here: creating a Path takes as long as writing a small file
     folder = os.path.dirname(path)
     temporary = os.path.join(folder, temporary_name())
     try:
         if folder and not os.path.isdir(folder):
             os.makedirs(folder, exist_ok=True)
         try:
-            # mode "x", as files of mkstemp are private
+            # not mkstemp, whose files only their owner may read
             with open(temporary, "xb") as file:
                 yield file
             os.replace(temporary, path)
@@ -187,7 +187,7 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     except OSError as error:
         ours = {os.fspath(path), temporary, *map(os.fspath, Path(path).parents)}
         if error.filename is not None and os.fspath(error.filename) not in ours:
-            raise  # from reading another file in the block
+            raise  # the block failed to read another file
         raise output_error(path, error) from error
 
 
@@ -215,7 +215,10 @@ def link_images(
     *,
     below: str = "",
 ) -> None:
-    """Link ``output_root/sensors/records_data`` and masks, or folders ``below``, to the source."""
+    """Link ``sensors/records_data`` and ``sensors/masks`` of the output to those of the source.
+
+    With ``below``, the links are the folders of this name inside the two.
+    """
     for name in folders:
         source = Path(source_root).resolve() / "sensors" / name
         link = Path(output_root) / "sensors" / name / below
@@ -227,7 +230,7 @@ def link_images(
 
 
 def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
-    """Link folders or images below ``sensors/records_data`` (``""``: itself) to a dataset."""
+    """Link folders or images below ``sensors/records_data``, or all of it (``""``), to datasets."""
     records = Path(output_root) / "sensors" / "records_data"
     for name, target in links.items():
         link = records / name if name else records
@@ -264,7 +267,7 @@ def _new_link(link: Path) -> Iterator[None]:
 
 
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
-    """Read one JSON file as ``model``; errors name the field."""
+    """Read a JSON file as ``model``; errors name the field."""
     text = read_text(path)
     try:
         return model.model_validate_json(text)
@@ -278,7 +281,7 @@ def write_json_model(path: Path | str, model: BaseModel) -> None:
 
 
 def write_json(path: Path | str, content: Any) -> None:
-    """Write plain JSON data, indented and atomically; NaN and infinity raise ValueError."""
+    """Write plain JSON data, indented, atomically; ValueError for NaN and infinity."""
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(path, f"{text}\n".encode())
 

@@ -30,23 +30,24 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 WRITABLE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
-# pillow's names of the supported photograph formats
+# supported formats of photographs, by pillow's names
 _FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "JPEG2000")
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp"}
 )
 UNREAD_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", ".cr3", ".arw"})
-# relative standard deviations of focal lengths, from EXIF and guessed
+# relative standard deviations of a focal length from EXIF and of a guessed focal length
 EXIF_DEVIATION, GUESS_DEVIATION = 0.1, 0.7
-# COLMAP's guess of the focal length, over the larger side
+# COLMAP's guess of the focal length, as a multiple of the larger side of the image
 _GUESS = 1.2
 _ORIENTATION, _MAKE, _MODEL, _EXIF, _GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
 # focal length in mm and 35 mm equivalent, focal plane resolution (x, y) and unit, image size
 _FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210, 0xA002, 0xA003)
 _JPEG = (".jpg", ".jpeg")
-# other suffixes become PNG if lossless, else JPEG; readers look at the content
+# images with these suffixes are written as PNG, those with other unknown suffixes as JPEG; their
+# names do not change, because readers detect the format from the content
 _LOSSLESS = (".pgm", ".pnm", ".gif", ".jp2")
-# images that use more than this share of their range are scaled, others are stretched
+# images that use more than this fraction of their range are scaled, others are stretched
 _MIN_RANGE = 0.5
 _STRETCHED_PERCENT = (0.1, 99.9)
 
@@ -87,7 +88,7 @@ def _decoded_by_opencv(content: bytes) -> NDArray[Any] | None:
 
 def pillow_pixels(image: Image.Image) -> NDArray[np.uint8]:
     """Convert an image opened by pillow, as :func:`read_image_rgb` does."""
-    if image.mode[0] in "IF":  # more than 8 bits, which pillow would cut off
+    if image.mode[0] in "IF":  # more than 8 bits, which pillow would clip
         return with_8_bits(np.repeat(np.asarray(image)[:, :, None], 3, axis=2))
     return np.ascontiguousarray(image.convert("RGB"))
 
@@ -95,8 +96,9 @@ def pillow_pixels(image: Image.Image) -> NDArray[np.uint8]:
 def with_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """Convert an image (H, W, 3) of any number type to uint8.
 
-    Values of uint16 or from 0 to 1 that use more than half of their range are scaled; others, such
-    as 12 bits in 16 or thermal counts, are stretched from percentiles 0.1 and 99.9.
+    uint16 values, and numbers from 0 to 1, are scaled if they span more than half of their range.
+    Other values, such as 12 bits in uint16 or thermal counts, are stretched so that their
+    percentiles 0.1 and 99.9 become 0 and 255.
     """
     if pixels.dtype == np.uint8:
         return np.ascontiguousarray(pixels)
@@ -136,7 +138,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int = 95) -> None:
     """Write uint8 (H, W, 3) RGB or (H, W) grey in the format of the suffix, atomically.
 
-    The bytes are deterministic. Suffixes not in WRITABLE_SUFFIXES give JPEG, or PNG if lossless.
+    The bytes are deterministic. A suffix that is not in WRITABLE_SUFFIXES gives PNG if it denotes a
+    lossless format, else JPEG.
     """
     path = Path(path)
     write_bytes(path, _encoded(path, image, jpeg_quality))
@@ -181,9 +184,10 @@ def check_image_file(path: Path) -> None:
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:
-    """Refuse a truncated file, which OpenCV silently fills with grey; Pillow is strict."""
+    """Raise DataError for a truncated file, which OpenCV silently fills with grey."""
     if content.startswith(b"\xff\xd8"):
-        # entropy-coded data never contains these markers, and those of a thumbnail come first
+        # end-of-image marker after the last start-of-scan: entropy-coded data contains neither, and
+        # the markers of a thumbnail come first
         complete = content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
     else:
         complete = content.startswith(b"\x89PNG") and content.endswith(b"IEND\xaeB`\x82")
@@ -191,12 +195,13 @@ def _check_complete(path: Path | str | None, content: bytes) -> None:
         return
     from PIL import Image
 
+    # pillow rejects truncated files
     with reading(path, "an image"), Image.open(BytesIO(content)) as image:
         image.load()
 
 
 def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.float32]:
-    """Read a depth map, float32 (H, W) in metres, of its sensor's size."""
+    """Read a depth map, float32 (H, W) in metres, of the depth sensor's size."""
     path = Path(path)
     content = read_content(path)
     expected = 4 * width * height
@@ -213,7 +218,7 @@ def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
 
 
 def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
-    """Write every n-th frame of a video, upright, as ``000120.jpg``; yield the names."""
+    """Write each ``every``-th frame of a video, upright, as ``000120.jpg``; yield the names."""
     import cv2
 
     check_image_file(video)
@@ -313,12 +318,12 @@ def photo_of(image: Image.Image) -> Photo:
 def _tried(read: Callable[[], T]) -> T | None:
     try:
         return read()
-    except Exception:  # pillow raises many kinds; a damaged part of EXIF counts as missing
+    except Exception:  # pillow raises many kinds of errors; damaged EXIF fields count as missing
         return None
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the numbers of an EXIF tag; unknown parts, such as seconds 0/0, end the list."""
+    """Return the numbers of an EXIF tag, up to the first unknown one, such as seconds of 0/0."""
     values = value if isinstance(value, tuple) else (value,)
     return list(takewhile(math.isfinite, map(float, values)))
 
@@ -364,7 +369,10 @@ def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
 
 
 def _blank_with_exif(exif: Image.Exif, make: str, model: str, size: tuple[int, int]) -> bytes:
-    """Return a blank JPEG with the EXIF: COLMAP reads few formats, and decodes the files."""
+    """Return a blank JPEG with make, model and focal tags, for COLMAP to infer the focal length.
+
+    COLMAP reads only few image formats, and it would decode all pixels of the photograph.
+    """
     from PIL import Image
     from PIL.TiffImagePlugin import IFDRational
 

@@ -1,7 +1,8 @@
 """Output folders of commands: ownership, and output that appears only on success.
 
-A command may write to a folder that is new, empty, or marked. The mark file names the kind of the
-folder, then the files of the last command, which the next command replaces.
+A command may write to a folder that is new, empty, or marked as a folder of the command's kind. The
+mark is a file with this kind and the files that the last command wrote; the next command replaces
+these files.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 def claim_folder(folder: Path, *, kind: str, force: bool = False) -> bool:
     """Create and mark a folder that is new, empty or of the same ``kind`` (one word).
 
-    Raise OutputError for others, unless forced. Return whether the mark is new and may be released.
+    Raise OutputError for any other folder, unless forced. Return whether the mark is new;
+    :func:`release_folder` may then remove it.
     """
     check_claim(folder, kind=kind, force=force)
     with writing(folder):
@@ -41,7 +43,7 @@ def claim_folder(folder: Path, *, kind: str, force: bool = False) -> bool:
 
 
 def check_claim(folder: Path, *, kind: str, force: bool = False) -> None:
-    """Raise OutputError for a folder that :func:`claim_folder` refuses."""
+    """Raise OutputError for a folder that :func:`claim_folder` rejects."""
     with writing(folder):
         if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder}: is a file, a folder is needed")
@@ -75,7 +77,8 @@ def staged_output(
 ) -> Iterator[Path]:
     """Yield a staging folder whose content moves to ``folder`` when the block succeeds.
 
-    Files of the last command of the same kind are removed, unless ``adds`` is set; others are kept.
+    Files that the last command of this kind wrote are removed, unless ``adds`` is set. All other
+    files in ``folder`` are kept.
     """
     folder = Path(folder)
     check_claim(folder, kind=kind, force=force)
@@ -113,7 +116,7 @@ def _files_below(folder: Path) -> set[str]:
 
 
 def _remove_old_files(folder: Path, names: Iterable[str]) -> None:
-    """Remove listed files and links and emptied folders, without following links."""
+    """Remove the listed files and links, and folders that become empty, without following links."""
     for name in names:
         with contextlib.suppress(DataError, OSError):
             path = folder / check_relative(name)
@@ -139,8 +142,8 @@ def _merge(source: Path, target: Path) -> None:
 def files_below(*folders: Path) -> Iterator[Path]:
     """Yield the files below folders, without archives, hidden files and outputs of commands.
 
-    Links are followed. For an unpacked download they are the same before and after
-    its archive is deleted.
+    Links are followed. Archives are omitted so that the files of a dataset stay the same when its
+    archives are deleted after unpacking.
     """
     for root in folders:
         for place, names, files in os.walk(root, followlinks=True):
@@ -154,5 +157,5 @@ def _is_data(folder: Path, name: str) -> bool:
     path = folder / name
     if name.startswith(".") or (path / MARKER).is_file():
         return False
-    # a link to a parent folder never ends
+    # following a link to a parent folder would never end
     return not (path.is_symlink() and folder.resolve().is_relative_to(path.resolve()))

@@ -1,16 +1,17 @@
 """The tables of a workspace: localization results, map quality and match counts.
 
 ==================== =============================================================================
-status.csv           outcome of every query, with the localized poses
-clusters.csv         clusters of candidates in which every query was localized
-covariance.csv       uncertainty of every localized pose
+status.csv           outcome of every query: reason, numbers of matches and inliers, confidence
+poses.csv            every pose and its camera centre, written by ``stages/query_poses.py``
+clusters.csv         clusters of candidates that were tried for every query, and their poses
+covariance.csv       covariance of every localized pose that has one
 refinement.csv       outcome of refining each query's pose, step by step
-map_consistency.csv  displacement of a map's own images by refinement, by coordinate frame
+map_consistency.csv  displacement of the map images when they are refined, per coordinate frame
 depth.csv            stereo depth of the map's images
-match_counts.csv     raw and verified matches of each pair, in the folder of a feature type
+match_counts.csv     numbers of raw and verified matches of each pair, per feature type
 ==================== =============================================================================
 
-Readers and writers take the path of the file and keep its row order, unless noted.
+The functions below take the path of the file and keep the order of the rows, unless noted.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ CONSISTENCY_FILE = "map_consistency.csv"
 def status_row(result: LocalizationResult) -> dict[str, Any]:
     """Return a result as a row of ``status.csv``.
 
-    The columns are the parameters of :func:`_result_of_row`: add new columns there as well.
+    The columns are the parameters of :func:`_result_of_row`; add new columns to both.
     """
     return {
         "image": result.name,
@@ -99,12 +100,13 @@ def _result_of_row(
 
 
 def read_status(path: Path | str) -> dict[str, LocalizationResult]:
-    """Read ``status.csv``: results by name, without poses and refinements."""
+    """Read ``status.csv``: results by name, sorted, without poses and refinements."""
     rows = read_records(path, _result_of_row, optional=("confidence", "remarks"))
     return {row.name: row for row in sorted(rows, key=lambda row: row.name)}
 
 
 def write_status(path: Path | str, results: Iterable[LocalizationResult]) -> None:
+    """Write ``status.csv``, sorted by name."""
     rows = []
     for result in sorted(results, key=lambda result: result.name):
         row = status_row(result)
@@ -142,7 +144,7 @@ def write_covariances(path: Path, results: Iterable[LocalizationResult]) -> None
 
 
 def write_clusters(path: Path, results: Iterable[LocalizationResult]) -> None:
-    """Write ``clusters.csv``: clusters of each result, with unrefined poses, sorted by image."""
+    """Write ``clusters.csv``, sorted by image: the clusters of each result with unrefined poses."""
     columns = ("image", "cluster", "chosen", "num_matches", "num_inliers", "score", "reason")
     rows = [
         (
@@ -187,7 +189,7 @@ def _refinement_row(
 def read_refinement(
     path: Path | str, refined: Mapping[str, RigidTransform]
 ) -> dict[str, tuple[PoseRefinement, ...]]:
-    """Read ``refinement.csv``: steps by image; the last one ended at the ``refined`` pose."""
+    """Read ``refinement.csv``: steps by image; ``refined`` holds the poses after the last step."""
     by_image: dict[str, list[PoseRefinement]] = {}
     for image, step in read_records(path, _refinement_row):
         by_image.setdefault(image, []).append(step)
@@ -224,8 +226,9 @@ def write_refinement(path: Path, results: Iterable[LocalizationResult]) -> None:
 class ConsistencyRow:
     """One row of ``map_consistency.csv``: a refiner's check of one coordinate frame of a map.
 
-    The measures are medians of ``megloc_kapture.refinement.references.Displacement``; NaN if none.
-    ``reason`` explains why query poses are not refined; empty if they are.
+    ``moved_m`` to ``squared_distance`` are medians over the tested images, NaN without such images;
+    see ``megloc_kapture.refinement.references.Displacement``. ``reason`` says why query poses are
+    not refined; it is empty if they are.
     """
 
     frame: str
@@ -257,7 +260,8 @@ def _rounded(row: object) -> list[object]:
 class DepthRow:
     """One row of ``reconstruction/depth.csv``: stereo depth of a map image.
 
-    ``sources`` are the compared images, best first; ``fill`` is the share of pixels with depth.
+    ``sources`` are the images that the map image was compared with, best first. ``fill`` is the
+    fraction of pixels with depth.
     """
 
     image: str

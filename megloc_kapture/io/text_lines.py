@@ -1,7 +1,7 @@
 """Lines, numbers, transforms and camera lists of small text files.
 
 Errors name file and line. A camera list has a row ``NAME MODEL WIDTH HEIGHT PARAMS...`` per image
-(Aachen, hloc), or one for all images (COLMAP's cameras.txt).
+(Aachen, hloc), or a single row for all images (COLMAP's cameras.txt).
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ MAX_ROTATION_ERROR = 1e-3
 
 @contextlib.contextmanager
 def reading_lines(path: Path, *, comments: bool = False) -> Iterator[Iterator[str]]:
-    """Yield an iterator of the stripped lines that are not blank; ``comments`` drops # lines.
+    """Yield an iterator of the stripped lines that are not blank.
 
-    Errors in the block get file and line; a ValueError (from ``float``) becomes a DataError.
+    With ``comments``, lines that begin with # are skipped. A DataError in the block gets file and
+    line. A ValueError, as from ``float``, becomes a DataError with file and line.
     """
     texts = read_text(path).split("\n")
     number: int | None = None
@@ -95,8 +96,8 @@ _ROW = re.compile(
 class CameraList:
     """Cameras by the names of their images.
 
-    An image gets the row with the longest name that is the end of its path (whole folders), else
-    the only row whose name ends with the image name.
+    An image gets the row whose name is the longest suffix of the image's path, in whole path
+    components. Without such a row, it gets the only row whose name ends with the image's name.
     """
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
@@ -106,7 +107,7 @@ class CameraList:
             self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
 
     def of(self, image: str, path: Path) -> Camera | None:
-        """Return the camera of an image by name and file; None if no row matches."""
+        """Return the camera of an image by its name and path; None if not exactly one row fits."""
         names = self._by_file.get(PurePosixPath(image).name, [])
         file = path.absolute().as_posix()
         ending = [name for name in names if file.endswith(f"/{name}")]

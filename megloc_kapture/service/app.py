@@ -1,7 +1,7 @@
 """HTTP service that estimates the poses of uploaded images; see docs/serve.md.
 
-Errors are JSON, ``{"error": "..."}``. Client errors have a status of 400 to 499 and a message; an
-internal error is a 500 whose details are only logged.
+Errors are JSON, ``{"error": "..."}``. Client errors have a status from 400 to 499 and an explaining
+message; an internal error has the status 500, and its details are only logged.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _PAGE_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src blob: data:; connect-src 'self'"
 )
-# reading up to this multiple of the limit lets a sending client see the refusal
+# read too large requests up to this multiple of the limit, so that clients receive the error
 _READ_BEYOND_LIMIT = 3
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _FORM = {
@@ -81,22 +81,22 @@ class Answer(BaseModel):
     """Result for an image: a pose, or the reason for its absence."""
 
     localized: bool
-    reason: str | None = Field(description="why there is no pose")
+    reason: str | None = Field(description="reason why there is no pose")
     cam_from_world: Transform | None
-    camera_center: Vector | None = Field(description="in the map")
+    camera_center: Vector | None = Field(description="camera centre in the map's frame")
     covariance: list[list[float]] | None = Field(
         description="6 by 6: rotation in radians, then translation in the unit of the map, of a "
         "left perturbation of cam_from_world"
     )
-    confidence: float | None = Field(description="the probability that the pose is right")
+    confidence: float | None = Field(description="probability that the pose is correct")
     num_matches: int
     num_inliers: int
     candidates: list[str] = Field(description="matched map images, best first")
     remarks: list[str]
     frame: str | None = Field(description="the pose's coordinate frame, if the map has several")
     camera: CameraModel = Field(
-        description="camera of the pose: the request's; else from EXIF for the upright image, its "
-        "focal length estimated with the pose"
+        description="camera of the request; if omitted, the camera of the upright image, whose "
+        "focal length is initialised from EXIF or a guess and estimated with the pose"
     )
 
     @classmethod
@@ -143,8 +143,8 @@ def read_camera(text: str) -> Camera:
 def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> ImageQuery:
     """Read a query from an image file's bytes and a camera as JSON.
 
-    The header is checked before decoding. Raises HTTPException for another format (415) or too
-    many pixels (413), and DataError for a broken image or camera.
+    The image's header is checked before decoding. HTTPException for another format (415) or too
+    many pixels (413), DataError for a broken image or camera.
     """
     try:
         image = Image.open(BytesIO(content), formats=["JPEG", "PNG"])
@@ -152,7 +152,7 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
         raise HTTPException(
             413, f"the image has more than {max_megapixels:g} megapixels"
         ) from error
-    except Exception as error:  # pillow raises many kinds on broken headers
+    except Exception as error:  # pillow raises many kinds of errors for broken headers
         raise HTTPException(415, "the image is neither JPEG nor PNG, or broken") from error
     width, height = image.size
     if width * height > max_megapixels * 1e6:
@@ -164,7 +164,7 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
     except DataError as error:
         raise DataError(f"the image is broken: {error.message}") from error
     suffix = ".png" if image.format == "PNG" else ".jpg"
-    name = f"image{suffix}"  # preprocessing treats JPEG and PNG as the command line does
+    name = f"image{suffix}"  # preprocessing depends on the suffix
     if not camera:
         photo = photo_of(image)
         return ImageQuery(photo.upright_camera, turned_upright(pixels, photo.orientation), name)
@@ -178,12 +178,14 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
 
 
 class Service:
-    """A localizer with limits, shared by worker threads; clients send ``token`` if given.
+    """A localizer with limits, shared by worker threads.
 
     Parameters
     ----------
-    threads : images localized in parallel; None means all cores.
-    max_waiting : images that may wait; more are refused (503).
+    threads : number of images localized in parallel; None means all cores.
+    max_waiting : number of images that may wait; further images are rejected (503).
+    max_mb, max_megapixels : largest request and largest image; larger ones are rejected (413).
+    token : secret that clients must send; None means that everybody has access.
     """
 
     def __init__(
@@ -203,7 +205,7 @@ class Service:
         self._pending, self._max_pending = 0, num_threads + max_waiting
 
     def check_token(self, request: Request) -> None:
-        """Refuse requests without the token, in constant time."""
+        """Raise HTTPException for requests without the token, compared in constant time."""
         if self._token is None:
             return
         kind, _, sent = request.headers.get("authorization", "").partition(" ")
@@ -292,7 +294,11 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
     async def localize(
         request: Request,
         camera: Annotated[
-            str | None, Query(max_length=2000, description="a CameraModel as JSON; or in the form")
+            str | None,
+            Query(
+                max_length=2000,
+                description="a CameraModel as JSON; a form may have it as a field instead",
+            ),
         ] = None,
     ) -> Response:
         answer = await service.answer(request, camera)

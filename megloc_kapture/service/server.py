@@ -1,4 +1,4 @@
-"""Start of the service: load the networks, listen, and draw the map from above."""
+"""Start of the service: load the networks, listen, and prepare a top view of the map."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera
 
 _MAX_POINTS, _MAX_CAMERAS = 15_000, 3_000
-_SHUTDOWN_S = 60  # lets running requests finish; slow uploads are cut off then
+_SHUTDOWN_S = 60  # running requests may finish in this time; slow uploads are cut off
 
 
 def prepared_localizer(kapture_map: KaptureMap, options: PipelineOptions) -> Localizer:
-    """Return a localizer with loaded networks, so that missing files fail at the start."""
+    """Return a localizer with loaded networks; missing files raise their error here."""
     localizer = Localizer(kapture_map, options=options)
     kapture_map.check()
     for local in localizer.types:
         _ = local.extractor
-    # noise matches nothing, but exercises every step
+    # noise matches nothing, but its localization loads every network
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
     with single_threaded():
         localizer.localize(noise, Camera.pinhole(320, 240, 300.0))
@@ -47,9 +47,9 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def serve(service: Service, bound: socket.socket, *, log_requests: bool = False) -> None:
-    """Serve until SIGTERM or SIGINT, which takes effect after running requests have finished."""
+    """Serve until SIGTERM or SIGINT; running requests may finish."""
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
-    cv2.setNumThreads(1)  # images are localized in parallel instead
+    cv2.setNumThreads(1)  # several images are localized in parallel instead
     app = make_app(service, map_overview(service.localizer.map))
     config = uvicorn.Config(
         app,
@@ -64,11 +64,12 @@ def serve(service: Service, bound: socket.socket, *, log_requests: bool = False)
 
 
 def map_overview(kapture_map: KaptureMap) -> bytes:
-    """Return the map from above as JSON.
+    """Return a top view of the map as JSON.
 
-    ``right`` and ``up`` are unit vectors of the world, ``origin`` a point in it; ``points``
-    [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...] are relative to these and
-    subsampled if many. ``images`` counts the map's images, ``unit`` is ``m`` or ``units``.
+    The world vectors ``right`` and ``up`` and the world point ``origin`` define the coordinates of
+    the view. ``points`` [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...] are in
+    these coordinates, and subsampled if there are many. ``images`` is the number of map images,
+    ``unit`` is ``m`` or ``units``.
     """
     from megloc_kapture.evaluation.report.queries import top_view
 

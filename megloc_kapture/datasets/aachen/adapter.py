@@ -1,7 +1,7 @@
-"""Aachen Day-Night, versions 1.0 and 1.1: a city by day, queried by day and at night.
+"""Aachen Day-Night, versions 1.0 and 1.1: a map of a city by day, queries by day and at night.
 
 The official layout has an NVM model in version 1.0 and a COLMAP model in version 1.1; kapture's
-downloader leaves kapture folders.
+downloader makes kapture folders.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ Wanted = Literal["auto", "1.0", "1.1"]
 
 DAY, NIGHT = "day", "night"
 DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER = "db", "sequences", "query"
-# v1.1's night list contains v1.0's queries and these
+# night queries that v1.1 adds to those of v1.0
 ADDITIONAL_NIGHT = "query/night/nexus5x_additional_night/"
 
-# first timestamp of each list; map images start at 0
+# first timestamp of the queries of each list; timestamps of map images start at 0
 _FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
 _IMAGE_FOLDERS = ("images_upright", "images/images_upright")
-# archive and folder differ by an underscore; both occur
+# names of the archive and of the folder in it, which differ by an underscore
 _MODEL_FOLDERS = ("aachen_v_1_1", "aachen_v1_1")
 
 _NAME_OF_V1_1 = ("v1.1", "v1_1", "v11")
 _NUM_DATABASE, _NUM_SEQUENCES = 4328, 2369
 _NUM_DAY, _NUM_NIGHT = 824, {"1.0": 98, "1.1": 191}
-# of v1.1's map images and night queries
+# cameras of v1.1's map images and night queries
 _NUM_CAMERAS = 5234
 # visuallocalization.net recognises versions by these file names
 _POSE_FILE_STEMS = {"1.0": "Aachen", "1.1": "Aachen_v1_1"}
@@ -61,7 +61,7 @@ _POSE_FILE_STEMS = {"1.0": "Aachen", "1.1": "Aachen_v1_1"}
 
 @dataclass
 class AachenImages:
-    """The images of an import; ``conditions`` by query in list order, day first."""
+    """The images of an import; ``conditions`` maps queries to day or night, in list order."""
 
     version: Version
     mapping: KaptureData = field(default_factory=KaptureData)
@@ -159,7 +159,10 @@ class Layout:
                 images.add_map_image(name, position, position, camera, pose)
 
     def _centred(self, nvm: NvmModel, position: int) -> Camera:
-        """Return the NVM's camera, which equals the published one, as far as is known."""
+        """Return the NVM's camera with a centred principal point.
+
+        No image is known whose published camera differs from it.
+        """
         name = nvm.names[position]
         width, height = image_size(self.images / name)
         focal, k = float(nvm.focal_px[position]), float(nvm.k_colmap[position])
@@ -217,7 +220,7 @@ def _version_of(form: KaptureForm, wanted: Wanted, images: Sequence[KaptureImage
         image.name.startswith((f"{SEQUENCES_FOLDER}/", ADDITIONAL_NIGHT)) for image in images
     )
     if wanted == "1.0" and is_newer:
-        raise OptionError(f"version=1.0 is wanted, and {form.root} is v1.1, whose poses are others")
+        raise OptionError(f"version=1.0, but {form.root} is v1.1, whose poses are different")
     if wanted != "auto":
         return wanted
     path = form.root.resolve()
@@ -233,7 +236,8 @@ class AachenOptions(Options):
     """The part of Aachen Day-Night to import."""
 
     version: Literal["auto", "1.0", "1.1"] = Field(
-        default="auto", description="auto: 1.1 if 3D-models/aachen_v_1_1 exists"
+        default="auto",
+        description="version of the dataset; auto: 1.1 if 3D-models/aachen_v_1_1 exists",
     )
     reference_model: bool = Field(
         default=False, description="import the SIFT model too, as a kapture map in reference/"
@@ -292,8 +296,8 @@ class Aachen:
         remarks, reference, database = [], None, None
         if images.version == "1.0" and not layout.database_intrinsics.is_file():
             remarks.append(
-                f"Without {layout.database_intrinsics.name} the map images' principal points are "
-                "taken to be in the middle, and their sizes from the image files."
+                f"Without {layout.database_intrinsics.name}, the principal points of map images "
+                "are assumed at the image centres, and the image sizes are read from the files."
             )
         if left_out:
             remarks.append(

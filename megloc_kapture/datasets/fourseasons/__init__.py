@@ -54,7 +54,7 @@ def read_calibration(folder: Path) -> StereoCalibration:
 
 
 def read_pinhole(path: Path) -> Camera:
-    """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, the size, twice."""
+    """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, then the size, twice."""
     with reading_lines(path, comments=True) as lines:
         (model, *values), *sizes = map(fields_of, lines)
         params = list(map(float, values))
@@ -66,16 +66,16 @@ def read_pinhole(path: Path) -> Camera:
         return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
-# pose of the undistorted left camera in SLAM units, metres per unit, and the fusion quality (2
-# fused with GNSS, 1 interpolated, 0 none); None if a field is missing
+# pose of the undistorted left camera in SLAM units; metres per SLAM unit and fusion quality (2
+# fused with GNSS, 1 interpolated, 0 none), each None if the row lacks it
 GnssPose = tuple[RigidTransform, float | None, float | None]
 
 
 def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     """Read ``slam_from_cam``, scale and fusion quality of ``GNSSPoses.txt`` by timestamp (ns).
 
-    A row is ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; published rows have
-    10 fields, their header announces 11.
+    A row is ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``. Published rows have
+    10 fields, although their header names 11.
     """
 
     def parse(fields: list[str]) -> GnssPose:
@@ -92,7 +92,7 @@ def read_poses(path: Path) -> dict[int, RigidTransform]:
 
 
 def timestamp_of_name(stem: str) -> int | None:
-    """Return the time (ns) encoded in a file name; None for other names."""
+    """Return the time (ns) that is the stem of a file name; None for other stems."""
     return int(stem) if _TIMESTAMP.fullmatch(stem) else None
 
 
@@ -110,7 +110,7 @@ def _transform(fields: Sequence[str]) -> RigidTransform:
 
 
 def read_transformations(path: Path) -> tuple[RigidTransform, RigidTransform, float | None]:
-    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers.
+    """Read ``Transformations.txt``: a line ``# name: ...`` before each line of numbers.
 
     Return ``scene_from_slam`` without scale (the scene's axes are east, north and up),
     ``earth_from_scene`` (ECEF), and metres per SLAM unit or None.
@@ -133,7 +133,7 @@ def read_transformations(path: Path) -> tuple[RigidTransform, RigidTransform, fl
 
 
 def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
-    """Return source and target recording of a file name; the source may be omitted."""
+    """Return source and target recording of a file name, the source None if the name lacks it."""
     for pattern in _RELOCALIZATION_NAMES:
         if match := pattern.fullmatch(name):
             parts = match.groupdict()
@@ -208,7 +208,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class RelocalizationFile:
-    """A list of pairs requested by a challenge; the result file has the same name."""
+    """A list of pairs requested by a challenge; the pose file to submit has the same name."""
 
     path: Path
     source: str
@@ -241,7 +241,7 @@ def _folders(root: Path) -> list[Path]:
 
 
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
-    """Find relocalization files; without a source in their names they lie in its folder."""
+    """Find relocalization files; a file whose name lacks the source lies in the source's folder."""
     known = set(recordings)
     files: dict[str, RelocalizationFile] = {}
     for folder in _RELOCALIZATION_FOLDERS:
@@ -255,8 +255,8 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
                 source = owner
             if source is None:
                 raise DataError(
-                    "the file's name does not say whose map it means; it belongs into the folder "
-                    "of the reference recording",
+                    "the file's name does not say whose map it means; move the file into the "
+                    "folder of the reference recording",
                     path=path,
                 )
             if path.name in files:
@@ -265,13 +265,13 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
     return sorted(files.values(), key=lambda file: (file.source, file.path.name))
 
 
-# listed as missing if there is only a map recording
+# listed as a missing file if the only recordings are those of the map
 ANOTHER_RECORDING = "<another recording, for the queries>"
 
 
 @dataclass(frozen=True)
 class Selection:
-    """All ``recordings``, the imported ones, and their relocalization files."""
+    """All ``recordings`` by name, those imported as map and queries, and relocalization files."""
 
     recordings: dict[str, Recording]
     references: list[Recording]
@@ -284,7 +284,7 @@ def select(
 ) -> Selection:
     """Choose recordings by name, or by relocalization files.
 
-    Without either, the first recording with poses is the map and the others are queries.
+    Without names and files, the first recording with poses is the map and all others are queries.
     """
     recordings = find_recordings(root)
     files = find_relocalization_files(root, recordings)
@@ -303,8 +303,8 @@ def select(
     sources, targets = ([n for n in names if n in recordings] for names in (sources, targets))
     require(
         sources,
-        f"{len(recordings)} recordings, none for the map; needed are one with published poses "
-        "(GNSSPoses.txt or poses.txt) and another for the queries",
+        f"{len(recordings)} recordings, none for the map; a recording with published poses "
+        "(GNSSPoses.txt or poses.txt) and another one for the queries are needed",
         path=root,
     )
     if not targets:

@@ -1,10 +1,11 @@
 """4Seasons and the MLAD challenges: localization of one recording in another.
 
-A challenge's relocalization files, anywhere below the root, select the recordings and the queries,
-and assign a nearby keyframe to each query. Poses are in the reference recording's scene
-(east-north-up), with an origin near its keyframes.
+A challenge's relocalization files lie in the root, in one of its folders, or in
+``RelocalizationFiles*`` below either. They select the recordings and the queries, and assign a
+nearby keyframe to each query. Poses are in the reference recording's scene (east-north-up), with an
+origin near its keyframes.
 ``ECEF_from_cam = e_from_gpsw * inv(w_from_gpsw) * s_from_as * scale * slam_from_cam``, with the
-scale of the pose's row.
+scale of the pose's row or, if the row lacks it, of Transformations.txt.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Options, RigidTransform
 
 NAME = "4seasons"
-# thresholds of other long-term benchmarks, for runs without a challenge
+# thresholds of other long-term benchmarks, used without relocalization files
 _GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
@@ -70,8 +71,8 @@ class FourSeasonsOptions(Options):
     )
     frames: Literal["keyframes", "all"] = Field(
         default="keyframes",
-        description="images: keyframes with a pose (of a query recording those in the "
-        "relocalization files, if any), or all on disk",
+        description="images to import: keyframes with a pose (of a query recording, those in the "
+        "relocalization files, if any), or all images on disk",
     )
     stereo: bool = Field(default=True, description="also import the right camera")
     min_fusion_quality: int = Field(
@@ -174,7 +175,7 @@ class FourSeasons:
     ) -> dict[str, KeyframePoses]:
         poses_of = {}
         for recording in references:
-            # each poses.txt has a separate frame
+            # poses.txt cannot be used for several recordings: each file has a separate frame
             keyframes = self._poses(recording, missing, on_earth=len(references) > 1)
             if keyframes is None:
                 raise DataError(
@@ -223,7 +224,7 @@ def _known_poses(
     published: Mapping[tuple[int, str], RigidTransform],
     truth_folder: KaptureData | None,
 ) -> KaptureData | None:
-    """Return the queries with their published poses, or those in ``ground_truth/``."""
+    """Return the queries with their published poses, else with those in ``ground_truth/``."""
     times = {timestamp for timestamp, _ in query.records_camera}
     poses = {key: pose for key, pose in published.items() if key[0] in times}
     known = with_poses(query, poses)
@@ -237,7 +238,10 @@ def _known_poses(
 def _image_groups(
     chosen: Selection, mapping: KaptureData, query: KaptureData
 ) -> dict[str, ImageGroup]:
-    """Return image groups: conditions are recordings; only (requested) left images are scored."""
+    """Return image groups; the condition of a query is its recording.
+
+    Only left images are scored and, if relocalization files select queries, only these.
+    """
     groups = {
         image: ImageGroup(location=image.partition("/")[0]) for image in mapping.image_names()
     }
@@ -312,7 +316,7 @@ RIG = "car"
 
 @dataclass
 class ImageRecords:
-    """Images of the map or of the queries; ``suffixes`` of ids are shared by both."""
+    """Images of the map or of the queries; both share the ``suffixes`` of sensor ids."""
 
     suffixes: dict[StereoCalibration, str]
     missing: Missing
@@ -340,7 +344,7 @@ class ImageRecords:
         return car
 
 
-# a query may be matched with map images of this many keyframes before and after its reference
+# a query may be matched with the images of this many keyframes before and after its reference
 NEIGHBOURS = 20
 ImageKey = tuple[str, int]  # recording and timestamp of a query
 
@@ -352,10 +356,11 @@ def challenge_tables(
     mapping: KaptureData,
     query: KaptureData,
 ) -> tuple[list[RelocalizationPair], dict[str, tuple[str, ...]], dict[ImageKey, RigidTransform]]:
-    """Express the relocalization files by imported images; ``cams_from_local`` of left cameras.
+    """Convert the relocalization files to tables of imported images.
 
-    Return the pairs, the permitted map images of each query, and ``cam0_from_local`` by recording
-    and timestamp where it is known. Pairs without a reference pose or without images are left out.
+    ``cams_from_local`` holds poses of the left cameras by recording and timestamp. Return the
+    pairs, the permitted map images of each query, and the known ``cam0_from_local`` of queries.
+    Pairs without a reference pose or without images are left out.
     """
     pairs: list[RelocalizationPair] = []
     truth: dict[ImageKey, RigidTransform] = {}
@@ -395,8 +400,8 @@ def challenge_tables(
 class KeyframePoses:
     """The poses of one recording's keyframes, by timestamp (ns).
 
-    ``scene_from_cam`` is for the undistorted left camera, in metres; ``earth_from_scene`` goes to
-    ECEF; ``dropped`` keyframes have poor GNSS fusion.
+    ``scene_from_cam`` is the pose of the undistorted left camera, in metres. ``earth_from_scene``
+    transforms to ECEF. ``dropped`` keyframes have a fusion quality that is too low.
     """
 
     scene_from_cam: Mapping[int, RigidTransform]
@@ -406,7 +411,7 @@ class KeyframePoses:
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """The frame of the map: a recording's scene, moved to ``origin`` (metres)."""
+    """The frame of the map: a recording's scene, moved so that ``origin`` (metres) becomes zero."""
 
     earth_from_scene: RigidTransform | None
     origin: tuple[float, float, float]
@@ -430,7 +435,7 @@ class LocalFrame:
         }
 
     def world(self) -> World:
-        """Return the transform back to ECEF, or to the frame of ``poses.txt``."""
+        """Return the transform to the official frame: ECEF, or the frame of ``poses.txt``."""
         scene = self.earth_from_scene or RigidTransform.identity()
         official_from_local = scene @ RigidTransform((1.0, 0.0, 0.0, 0.0), self.origin)
         return World(
@@ -443,7 +448,7 @@ class LocalFrame:
 def read_keyframe_poses(
     recording: Recording, *, min_fusion_quality: int, on_earth: bool, missing: Missing
 ) -> KeyframePoses | None:
-    """Return the published keyframe poses, or None; ``on_earth`` excludes ``poses.txt``."""
+    """Return the published keyframe poses, or None; ``on_earth`` rules out ``poses.txt``."""
     plain = recording.folder / POSES
     if not on_earth and plain.is_file():
         poses = read_poses(plain)
@@ -475,7 +480,7 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
     require(
         poses,
         f"none of its {len(dropped)} poses has a fusion quality of {min_fusion_quality} or "
-        "better; lower min_fusion_quality takes them",
+        "better; a lower min_fusion_quality accepts them",
         path=path,
     )
     return KeyframePoses(poses, earth_from_scene, dropped)

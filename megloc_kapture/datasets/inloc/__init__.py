@@ -1,8 +1,8 @@
 """Files of InLoc: floors, scans, cutouts with scanned points, queries.
 
 ``<BLD>_cutout_<SCAN>_<YAW>_<PITCH>.jpg`` is cut out of a scan's panorama; ``<image>.mat`` has the
-scanned point of each pixel in the scan's frame (metres, z up). ``<BLD>_trans_<SCAN>.txt`` is the
-pose of the scan in its floor.
+scanned point of each pixel in the scan's frame (metres, z up). ``<BLD>_trans_<SCAN>.txt`` has the
+pose of the scan in the frame of its floor.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ROOTS = ("", "dataset")
 _CUTOUTS = ("database/cutouts", "cutouts", "database/cutouts_imageonly", "cutouts_imageonly")
 _ALIGNMENTS = ("database/alignments", "alignments")
 _QUERIES = ("query/iphone7", "queries/iphone7", "iphone7")
-# the published archive omits the "n", the documentation does not
+# the file name in the published archive lacks the "n", that in the documentation has it
 _WRONG_SCANS = ("know_incorrect.txt", "known_incorrect.txt")
 _SCAN = re.compile(r"[0-9]{3}")
 _PHOTOGRAPH = (".jpg", ".jpeg")
@@ -50,7 +50,7 @@ _SCAN_NUMBER = re.compile(r"(?<![0-9])[0-9]{1,3}(?![0-9])")
 
 @dataclass(frozen=True, slots=True)
 class Cutout:
-    """A cutout described by its name; the yaw is to the right of the scan's -x axis."""
+    """A cutout as described by its name; yaw is counted from the scan's -x axis, to the right."""
 
     building: str
     scan: str
@@ -66,10 +66,10 @@ class Cutout:
         return f"{self.building}_trans_{self.scan}.txt"
 
     def cam_from_scan(self) -> RigidTransform:
-        """Return the cutout's pose in its scan; both share their origin.
+        """Return the cutout's pose in its scan; both have the same origin.
 
-        The camera looks along the scan's -x axis (z up), rotated by the yaw to the right and by the
-        pitch upwards.
+        At zero yaw and pitch, the camera looks along the scan's -x axis (z up). The yaw rotates it
+        to the right, the pitch upwards.
         """
         pano_from_scan = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
         turn = Rotation.from_euler("yx", [-self.yaw_deg, -self.pitch_deg], degrees=True)
@@ -84,7 +84,7 @@ def parse_cutout_name(name: str) -> Cutout:
 
 
 def read_transformation(path: Path | str) -> RigidTransform:
-    """Read ``floor_from_scan``: the second 4x4 matrix of the file, after refinement."""
+    """Read ``floor_from_scan``: the second 4x4 matrix of the file, which is the refined one."""
     with reading_lines(Path(path)) as lines:
         rows = [fields for fields in map(str.split, lines) if _are_numbers(fields)]
     with named(path):
@@ -93,7 +93,7 @@ def read_transformation(path: Path | str) -> RigidTransform:
 
 
 def read_wrong_scans(path: Path | str) -> frozenset[str]:
-    """Read the numbers of wrongly placed scans, of up to 3 digits."""
+    """Read the numbers of wrongly placed scans; return them with three digits."""
     return frozenset(number.zfill(3) for number in _SCAN_NUMBER.findall(read_text(path)))
 
 

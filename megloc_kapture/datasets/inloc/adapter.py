@@ -1,7 +1,7 @@
 """InLoc: cutouts of laser scans with depth as the map, phone images as queries.
 
 Each floor has a separate coordinate frame. A cutout's pose follows from its name and the pose of
-its scan in the floor; its depth comes from the scanned points.
+its scan in the floor's frame; its depth comes from the scanned points.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 CUTOUTS, QUERIES, DEPTH = "database/cutouts", "query/iphone7", "depth"
 DATASET = "inloc"
-# iPhone 7: 28 mm lens, 36 mm film, 4032 px along the longer side
+# focal length over the longer side: the iPhone 7 has a 28 mm lens in equivalents of 36 mm film
 _FOCAL_SHARE = 28 / 36
-# horizontal field of view of 60 degrees: 0.5 / tan(30 deg)
+# focal length over width, for a horizontal field of view of 60 degrees: 0.5 / tan(30 deg)
 _CUTOUT_FOCAL_SHARE = 3**0.5 / 2
 # the 277 scans of the paper's 9,972 cutouts, with the floors published by the authors
 _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
@@ -58,7 +58,7 @@ class InLocOptions(Options):
     distractor_floors: bool = Field(
         default=False, description="also import CSE3, CSE4 and CSE5, without queries"
     )
-    depth: bool = Field(default=True, description="the scanned points as depth maps")
+    depth: bool = Field(default=True, description="import the scanned points as depth maps")
     depth_step: int = Field(
         default=1,
         ge=1,
@@ -156,7 +156,7 @@ class _Map:
     options: InLocOptions
     data: KaptureData = field(default_factory=KaptureData)
     groups: dict[str, ImageGroup] = field(default_factory=dict)
-    # record of a depth map -> file of points, and its cutout and camera
+    # record of a depth map -> file of points, cutout, and camera of the cutout
     depth: dict[str, tuple[Path, Cutout, Camera]] = field(default_factory=dict)
 
     def add(self, scan: Scan, missing: Missing) -> None:
@@ -234,7 +234,10 @@ def _queries(names: list[str], folder: Path) -> KaptureData:
 
 
 def depth_camera(camera: Camera, step: int) -> Camera:
-    """Return the camera of every ``step``-th row and column; kept pixels keep their centres."""
+    """Return the camera of an image of every ``step``-th row and column.
+
+    The rays through the centres of these pixels stay the same.
+    """
     focal, cx, cy = camera.params
     return Camera(
         "SIMPLE_PINHOLE",
@@ -245,7 +248,7 @@ def depth_camera(camera: Camera, step: int) -> Camera:
 
 
 def cutout_depth(path: Path, cutout: Cutout, camera: Camera, step: int) -> NDArray[np.float32]:
-    """Return the depth along the optical axis, float32 (H, W), metres; 0 without measurement."""
+    """Return the depth along the optical axis, float32 (H, W), metres; 0 where not measured."""
     points = read_cutout_points(path, camera.width, camera.height)
     z = points[::step, ::step] @ cutout.cam_from_scan().rotation_matrix()[2]
     return np.where(np.isfinite(z) & (z > 0), z, 0.0).astype(np.float32)

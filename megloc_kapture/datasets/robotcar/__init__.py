@@ -185,7 +185,7 @@ def _sorted_names(folder: Path) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Poses ``cam_from_world`` by image, in model order, and the known locations."""
+    """Poses ``cam_from_world`` by image, in model order, and locations by image where known."""
 
     poses: Mapping[ImageKey, RigidTransform]
     locations: Mapping[ImageKey, str]
@@ -195,7 +195,10 @@ class Reference:
 def read_reference(
     layout: Layout, model: ModelChoice, wanted: Sequence[str], missing: Missing
 ) -> Reference:
-    """Read poses and locations; the first of several individual models (one world) wins."""
+    """Read poses and locations of the reference images.
+
+    The individual models share a world frame; an image of several models belongs to the first.
+    """
     individual = layout.individual_models()
     merged = layout.is_merged(model)
     locations: dict[ImageKey, str] = {}
@@ -247,13 +250,17 @@ def _keys(names: Sequence[str], path: Path) -> list[ImageKey]:
                 path=path,
             )
         if keys.setdefault(image, name) != name:
-            raise DataError(f"{name!r} and {keys[image]!r} are one image", path=path)
+            raise DataError(f"{name!r} and {keys[image]!r} are the same image", path=path)
     return list(keys)
 
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """The lists of queries: poses of ``train``, pose file names of ``test``, by rear image."""
+    """The lists of queries.
+
+    ``train`` maps rear images to their public poses, ``test`` to their names in the pose file.
+    ``unlisted`` counts entries of these lists that ``queries_per_location`` lacks.
+    """
 
     locations: Mapping[ImageKey, tuple[str, ...]]
     train: Mapping[ImageKey, RigidTransform]
@@ -262,7 +269,7 @@ class Queries:
 
 
 def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missing: bool) -> Queries:
-    """Read the lists of queries; public poses are read for both versions if available."""
+    """Read the lists of queries; public poses are read for both versions, if present."""
     lists = layout.query_lists()
     if not lists:
         missing.files.append(layout.query_list("001"))
@@ -277,7 +284,7 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     train: dict[ImageKey, RigidTransform] = {}
     test: dict[ImageKey, str] = {}
     unlisted = 0
-    # optional for version 1
+    # version 1 does not need the training list
     wanted = version == 2 and missing.require(layout.train_list)
     if wanted or layout.train_list.is_file():
         for image, cam_from_world in read_train_poses(layout.train_list).items():
@@ -295,7 +302,10 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
 def read_test_names(
     path: Path, at_time: Mapping[tuple[str, int], ImageKey], *, allow_missing: bool
 ) -> tuple[dict[ImageKey, str], int]:
-    """Read version 2's test list: query -> its text in the list; count unknown entries."""
+    """Read version 2's test list; return query -> its text in the list, and a count.
+
+    The count is that of entries that ``queries_per_location`` lacks.
+    """
     test: dict[ImageKey, str] = {}
     unlisted = 0
     for image, text in read_test_list(path).items():

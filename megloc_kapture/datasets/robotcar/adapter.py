@@ -73,16 +73,20 @@ class RobotCarOptions(Options):
     """The part of RobotCar Seasons to import, and the published model of its poses."""
 
     version: Literal["auto", 1, 2] = Field(
-        default="auto", description="of the benchmark; auto: 2 if its test list exists"
+        default="auto",
+        description="version of the benchmark; auto: 2 if its test list exists or, for kapture "
+        "folders, if a rear query has a pose, else 1",
     )
     model: ModelChoice = Field(
         default="auto", description="source of the map's poses; auto prefers the merged model"
     )
     queries: Literal["all", "train", "test"] = Field(
-        default="all", description="version 2: import only the moments of one of its lists"
+        default="all",
+        description="version 2: import only the queries taken at the moments of this list",
     )
     train_as_map: bool = Field(
-        default=False, description="version 2: use its training images as map images, not queries"
+        default=False,
+        description="version 2: use the training images as map images, not as queries",
     )
     reference_model: bool = Field(
         default=False, description="import the model's points as a kapture map of SIFT features"
@@ -90,14 +94,14 @@ class RobotCarOptions(Options):
     location_prior: bool = Field(
         default=True,
         description="match a query only with map images of its location and camera, as the "
-        "benchmark permits; false: with all",
+        "benchmark permits; false: with all map images",
     )
 
 
 class RobotCar:
     """Adapter of RobotCar Seasons: all locations form one map in one metric frame.
 
-    Version 2's images with public poses are scored too, so that recall can be measured.
+    Queries of version 2 with public poses are scored too, so that recall can be measured.
     """
 
     name = "robotcar"
@@ -180,7 +184,7 @@ class RobotCar:
         if version == 2 and not test_list.is_file():
             remarks.append(
                 f"Without {test_list.name}, which kapture leaves out, the pose file holds all rear "
-                "images whose poses are not public; the list may be put into the root."
+                "images whose poses are not public; copy the list into the root to use it."
             )
         return self._dataset(
             selection,
@@ -228,8 +232,8 @@ class RobotCar:
     def _check_version(self, version: int) -> None:
         check_option(
             version == 2 or not (self.options.train_as_map or self.options.queries != "all"),
-            "train_as_map and queries are about version 2, whose lists are not there or not wanted "
-            "(version=2)",
+            "the options train_as_map and queries need version 2, but version 1 is imported; "
+            "add robotcar_v2_test.txt, or set version=2",
         )
 
 
@@ -239,7 +243,7 @@ def _kapture_form(root: Path) -> KaptureForm | None:
 
 def _read_points(layout: Layout, selection: Selection) -> tuple[list[str], SparsePoints]:
     images, points = read_points(layout, merged=selection.reference.merged)
-    # missing images keep their positions
+    # missing images stay in the list: the points refer to positions in it
     return [selection.map_images.get(image, f"{image.path}.jpg") for image in images], points
 
 
@@ -263,7 +267,8 @@ def _query_priors(
 ) -> dict[str, tuple[str, ...]]:
     """Return the permitted map images of each query: same location (or unknown) and camera.
 
-    A query without permitted map images keeps its location: it must not be matched with others.
+    A query without permitted map images keeps its locations as a prior, so that it is matched with
+    no map image at all.
     """
     map_paths = (*selection.map_images.values(), *selection.train_images.values())
     known = {groups[path].location for path in map_paths}
@@ -318,7 +323,7 @@ def _remarks(selection: Selection) -> list[str]:
     if unknown:
         folder = Layout(Path()).individual_model("NNN")
         remarks.append(
-            f"The location of {unknown} map images is not known: only the individual models tell "
+            f"The location of {unknown} map images is not known: only the individual models have "
             f"it ({folder}, extracted). All queries of their camera may be matched with them."
         )
     if selection.queries.unlisted:

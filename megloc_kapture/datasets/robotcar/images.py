@@ -1,4 +1,4 @@
-"""The imported images of RobotCar Seasons as kapture: choice, cameras, rig, records and poses."""
+"""The imported images of RobotCar Seasons as kapture: selection, cameras, rig, records, poses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SIZE_PX = (1024, 1024)
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The existing images, with paths below ``images/``; ``train_images`` join the map."""
+    """The existing images, with paths below ``images/``; ``train_images`` are added to the map."""
 
     version: int
     reference: Reference
@@ -46,7 +46,7 @@ class Selection:
     query_images: Mapping[ImageKey, str]
 
     def is_scored(self, query: ImageKey) -> bool:
-        """Return whether the benchmark, or its public half, evaluates a query."""
+        """Return whether a query is evaluated: by the benchmark, or because its pose is public."""
         if self.version == 1:
             return query.camera == SCORED_CAMERA
         return query in self.queries.test or query in self.queries.train
@@ -62,7 +62,10 @@ def select(
     cameras: Collection[str],
     find: Callable[[ImageKey], str | None],
 ) -> Selection:
-    """Choose the images of these cameras; ``part`` selects moments of version 2's lists."""
+    """Choose the images of these cameras.
+
+    ``part`` limits the queries to moments (condition and time) of version 2's train or test list.
+    """
     wanted: Iterable[ImageKey] = queries.locations
     if part != "all":
         wanted = _of_moments(wanted, queries.train if part == "train" else queries.test)
@@ -93,7 +96,7 @@ def _of_moments(images: Iterable[ImageKey], others: Iterable[ImageKey]) -> list[
 
 
 def with_rig_of_model(car: KaptureData, reference: Reference) -> KaptureData:
-    """Return the car with the rig estimated from the model's poses, if they suffice."""
+    """Return the car with a rig estimated from the model's poses, if these suffice."""
     members = rig_of_model(reference.poses)
     fits = members and set(members) <= set(car.sensors)
     return replace(car, rigs={RIG_ID: members}) if fits else car
@@ -108,7 +111,7 @@ def _record(image: ImageKey) -> tuple[int, str]:
 
 
 def read_car(layout: Layout, selection: Selection, missing: Missing) -> KaptureData:
-    """Read intrinsics and extrinsics; image sizes come from one image per camera."""
+    """Read intrinsics and extrinsics; the image size of a camera comes from one of its images."""
     images = {**selection.map_images, **selection.train_images, **selection.query_images}
     example = {image.camera: path for image, path in reversed(images.items())}
     sensors: dict[str, Sensor] = {}
@@ -129,7 +132,7 @@ def read_car(layout: Layout, selection: Selection, missing: Missing) -> KaptureD
 
 
 def mapping_data(selection: Selection, car: KaptureData) -> KaptureData:
-    """Return the map's images; each has a separate pose, as no rig fits exactly."""
+    """Return the map's images; each has a separate pose, because no rig fits the poses exactly."""
     images = {**selection.map_images, **selection.train_images}
     poses = {**selection.reference.poses, **selection.queries.train}
     return with_poses(with_images(car, images), {_record(image): poses[image] for image in images})
@@ -147,13 +150,13 @@ def query_truth(
 
 _ROOT = "rear"  # the rig's frame
 _MIN_MOMENTS = 10
-# some poses are wrong: rotations this many medians off are ignored
+# some poses are wrong: rotations whose deviation exceeds this many medians are ignored
 _OUTLIER = 3.0
 _ROUNDS = 3
 
 
 def rig_of_model(poses: Mapping[ImageKey, RigidTransform]) -> dict[str, RigidTransform]:
-    """Estimate ``sensor_from_rig``, rear camera as rig frame; empty with too few moments."""
+    """Estimate ``sensor_from_rig`` with the rear camera as rig frame; empty for too few moments."""
     rear = {key.timestamp: pose for key, pose in poses.items() if key.camera == _ROOT}
     members = {_ROOT: RigidTransform.identity()}
     for camera in CAMERAS:
@@ -199,8 +202,8 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
             )
         require(
             cameras.setdefault(key.camera, image.camera) == image.camera,
-            f"camera {key.camera} is not that of other images; all of RobotCar's images are "
-            "rectified to one for each side",
+            f"camera {key.camera} differs from that of other images; all images of a side of the "
+            "car are rectified to the same camera",
             path=image.file,
         )
         by_key[key] = image
@@ -231,10 +234,10 @@ def queries_of_kapture(
     *,
     allow_missing: bool,
 ) -> tuple[int, Queries]:
-    """Return the images under other conditions, and the version (detected if None).
+    """Return the version, detected if None, and the images of all but the reference condition.
 
-    Rear images with a pose are version 2's training images; without a test list, all others are
-    test images.
+    Rear images with a pose are version 2's training images. Without a test list, all other rear
+    images are test images.
     """
     keys = sorted(
         (key for key in images if key.condition != REFERENCE_CONDITION),

@@ -1,8 +1,8 @@
 """Keypoints, descriptors and global features: one binary array per image.
 
 They are stored inside a kapture (``reconstruction/<kind>/T/``) or in kapture-localization's orphan
-layout (``local_features/T/<kind>/``, ``global_features/T/global_features/``), as files or as one
-tar. The folder name ``T`` is the type name; the ``name`` in the configuration file is not used.
+layout (``local_features/T/<kind>/``, ``global_features/T/global_features/``), as files or as a
+single tar. The folder name ``T`` is the type name; ``name`` in the configuration file is not used.
 Arrays are raw, little-endian, row-major, without a header.
 """
 
@@ -44,17 +44,17 @@ CONFIG_HEADER: dict[str, str] = {
     "descriptors": "# name, dtype, dsize, keypoints_type, metric_type",
     "global_features": "# name, dtype, dsize, metric_type",
 }
-# kapture's four names; kapture evaluates the text
+# the only names accepted here; kapture evaluates the text as Python
 DTYPES: dict[str, np.dtype[Any]] = {
     name: np.dtype(code)
     for name, code in (("float32", "<f4"), ("float64", "<f8"), ("int32", "<i4"), ("uint8", "u1"))
 }
-_ROUNDING = 4e-7  # rows whose squared length is one up to this stay unchanged
+_ROUNDING = 4e-7  # rows whose squared length differs from 1 by at most this stay unchanged
 
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """The row of one ``keypoints.txt``, ``descriptors.txt`` or ``global_features.txt``.
+    """The only row of a ``keypoints.txt``, ``descriptors.txt`` or ``global_features.txt``.
 
     ``dsize`` counts numbers per row; ``metric_type`` is the distance, e.g. ``"L2"``.
     """
@@ -81,7 +81,7 @@ def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: boo
 
 
 def has_features(root: Path, kind: ArrayKind, type_name: str, image: str) -> bool:
-    """Return whether an image's file is in a folder of the orphan layout."""
+    """Return whether an image has features in a folder of the orphan layout."""
     folder = feature_folder(root, kind, type_name, orphan=True)
     return (folder / f"{check_relative(image)}{SUFFIX[kind]}").is_file()
 
@@ -138,7 +138,7 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
 
 
 class FolderBlobs:
-    """Blobs as files below ``folder`` with the given suffix."""
+    """Feature arrays (blobs) as files below ``folder`` with the given suffix."""
 
     def __init__(self, folder: Path, suffix: str) -> None:
         self._folder, self._suffix = folder, suffix
@@ -163,7 +163,7 @@ class FolderBlobs:
             return path.stat().st_size
 
     def read(self, name: str) -> bytes:
-        path = f"{self._folder}/{check_relative(name)}"  # much faster than a Path
+        path = f"{self._folder}/{check_relative(name)}"  # creating a Path is much slower
         with reading(path), open(path, "rb", buffering=0) as file:
             return file.readall()
 
@@ -172,13 +172,13 @@ class FolderBlobs:
 
 
 class TarBlobs:
-    """Blobs in an uncompressed tar, kapture's form for large sets; thread-safe."""
+    """Feature arrays in an uncompressed tar, kapture's form for many files; thread-safe."""
 
     def __init__(self, path: Path, suffix: str) -> None:
         self._path = path
         self._index: dict[str, tuple[int, int]] = {}
         if path.stat().st_size == 0:
-            return  # kapture creates an empty tar by touch
+            return  # kapture creates a tar as an empty file
         with reading(path, "an uncompressed tar"), named(path), tarfile.open(path, "r:") as tar:
             for member in tar:
                 if member.isreg() and member.name.endswith(suffix):
@@ -210,7 +210,7 @@ BlobSource: TypeAlias = FolderBlobs | TarBlobs
 
 
 class BlobWriter:
-    """Atomic writer of blobs below a folder; a context manager."""
+    """Writer of feature arrays below a folder, each atomically; a context manager."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -241,7 +241,10 @@ def blob_sources(folder: Path, kind: FeatureKind) -> list[BlobSource]:
 
 
 class FeatureReader:
-    """Features of one kind and type, from the first folder that holds an image; thread-safe."""
+    """Features of one kind and type; thread-safe.
+
+    The array of an image is read from the first folder that has it.
+    """
 
     def __init__(self, kind: ArrayKind, type_name: str, folders: Sequence[Path]) -> None:
         self.kind, self.type_name = kind, type_name
@@ -269,7 +272,7 @@ class FeatureReader:
         return any(name in source for source in self._sources)
 
     def length(self, image: str) -> int:
-        """Return the number of rows of an image from its file size."""
+        """Return the number of rows of an image's array, from the file size."""
         source, name = self._source(image)
         return self._num_rows(source.size(name), source, name)
 
@@ -281,7 +284,7 @@ class FeatureReader:
         return array.copy()
 
     def read_unchecked(self, image: str) -> NDArray[Any]:
-        """Read an image's array, read-only, without the check for infinity and NaN."""
+        """Read an image's array without a check for infinity and NaN; it is not writable."""
         source, name = self._source(image)
         content = source.read(name)
         rows = self._num_rows(len(content), source, name)
@@ -312,7 +315,10 @@ class FeatureReader:
 
 
 class KaptureVectors:
-    """Global features of images as blocks of unit rows, without a cache; zero rows stay zero."""
+    """Global features of images, normalised to unit length and read in blocks of rows.
+
+    Nothing is cached. Zero rows stay zero.
+    """
 
     def __init__(self, reader: FeatureReader, images: Sequence[str]) -> None:
         self._reader = reader
@@ -343,9 +349,10 @@ class KaptureVectors:
 
 
 class FeatureWriter(BlobWriter):
-    """Writer for the features of one kind and type, a context manager; files are atomic.
+    """Writer for the features of one kind and type; a context manager.
 
-    A stopped run can resume with the same configuration: ``image in writer`` is True if written.
+    Each file is written atomically. A stopped run can resume with the same configuration:
+    ``image in writer`` is True if the image's file exists.
     """
 
     def __init__(
@@ -364,7 +371,7 @@ class FeatureWriter(BlobWriter):
         if not path.exists():
             write_bytes(path, content)
         elif format_config(kind, read_config(path, kind)) != content:
-            raise OutputError(f"{path}: holds another configuration; remove its folder first")
+            raise OutputError(f"{path}: has another configuration; remove its folder first")
         super().__init__(folder)
 
     def __contains__(self, image: str) -> bool:

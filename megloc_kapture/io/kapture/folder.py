@@ -44,11 +44,11 @@ class KaptureFolder:
         self._observations: dict[str, Observations] | None = None
 
     def with_features(self, features_dirs: Sequence[Path | str]) -> KaptureFolder:
-        """Return a reader of the same folder with other feature folders."""
+        """Return the same kapture folder with other feature folders."""
         return KaptureFolder(self.root, features_dirs=features_dirs)
 
     def check_features_apart(self, other: KaptureFolder) -> None:
-        """Refuse readable features shared by two different images of one name."""
+        """Raise DataError if different images of the same name have the same features in both."""
         for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
             if _same_content(self.image_path(image), other.image_path(image)):
                 continue
@@ -123,7 +123,7 @@ class KaptureFolder:
         return dict(self._observations)
 
     def validate(self, *, deep: bool = False) -> None:
-        """Cross-check sensors, features and points; ``deep`` adds images and matches."""
+        """Cross-check sensors, features and points and, if ``deep``, also images and matches."""
         self.read()
         readers = {
             kind: {name: self._features(kind, name) for name in self.types(kind)}
@@ -168,7 +168,8 @@ class KaptureFolder:
         self, descriptors: FeatureReader, keypoints_by_type: dict[str, FeatureReader]
     ) -> None:
         keypoints_type = cast(str, descriptors.config.keypoints_type)
-        if keypoints_type not in keypoints_by_type:  # kapture's import of OpenMVG: SIFT_Regions
+        # converters may write the name of another tool here (OpenMVG: SIFT_Regions)
+        if keypoints_type not in keypoints_by_type:
             keypoints_type = descriptors.type_name
         keypoints = keypoints_by_type.get(keypoints_type)
         for image in descriptors.names:

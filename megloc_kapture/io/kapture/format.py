@@ -1,8 +1,8 @@
 """kapture's records in memory (sensors, rigs, trajectories, images) and its text format.
 
 Fields are separated by commas, with optional spaces; lines that start with ``#`` are comments.
-Timestamps and ids are integers of any length, never floats. kapture's own reader takes most of a
-second to import and 100 MB per worker; this one takes 20 ms and names file and line in errors.
+Timestamps are integers of any length, never floats. kapture's own reader takes most of a second to
+import and 100 MB per worker; this module takes 20 ms and names file and line in errors.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ FORMAT_VERSION = "1.1"
 FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"
 _READ_VERSIONS = ("1.0", FORMAT_VERSION)  # the tables are the same in both
 
-# stricter than float(), which takes "1_0", "nan" and digits of other scripts
+# stricter than float(), which accepts "1_0", "nan" and digits of other scripts
 FLOAT_PATTERN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _VERSION_PATTERN = re.compile(r"# kapture format:\s*([0-9]+\.[0-9]+)")
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """One row of ``sensors.txt``; a camera's ``params`` are model, width, height, parameters."""
+    """One row of ``sensors.txt``; for a camera ``params`` are model, width, height, parameters."""
 
     name: str
     sensor_type: str
@@ -56,7 +56,7 @@ class Sensor:
 
     @classmethod
     def from_camera(cls, camera: Camera, *, name: str = "", sensor_type: str = "camera") -> Sensor:
-        """Build the sensor whose :meth:`camera` is exactly ``camera``."""
+        """Return the sensor whose :meth:`camera` is exactly ``camera``."""
         params = (camera.model, str(int(camera.width)), str(int(camera.height)))
         return cls(name, sensor_type, params + tuple(_shortest(p) for p in camera.params))
 
@@ -65,9 +65,13 @@ class Sensor:
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
 
-    The dicts may change; once poses were requested, the members of existing rigs must not. ``rigs``
-    hold ``sensor_from_rig`` of sensors or rigs, ``trajectories`` ``device_from_world`` by
-    (timestamp, sensor or rig id); records are paths below ``records_data`` by (time, sensor id).
+    The dicts may be changed, except the members of existing rigs once poses have been requested.
+
+    Attributes
+    ----------
+    rigs : rig id -> sensor or rig id -> ``sensor_from_rig``.
+    trajectories : (timestamp, sensor or rig id) -> ``device_from_world``.
+    records_camera, records_depth : (timestamp, sensor id) -> path below ``records_data``.
     """
 
     sensors: dict[str, Sensor] = field(default_factory=dict)
@@ -115,11 +119,14 @@ class KaptureData:
             return self.sensors[sensor_id].camera()
 
     def cam_from_world(self, image: str) -> RigidTransform | None:
-        """Return the pose of an image from its camera or the first (nested) rig with a pose."""
+        """Return the pose of an image, from its camera or from the first rig with a pose, or None.
+
+        Rigs may be nested.
+        """
         return self.device_from_world(*self.record_of(image))
 
     def device_from_world(self, timestamp: int, device_id: str) -> RigidTransform | None:
-        """Return the pose of a sensor or rig at a time, directly or through rigs; None without."""
+        """Return the pose of a sensor or rig at a time, directly or through its rigs, or None."""
         if (timestamp, device_id) in self.trajectories:
             return self.trajectories[timestamp, device_id]
         for rig_id in self._parents().get(device_id, ()):
@@ -144,7 +151,7 @@ class KaptureData:
 
 
 def _shortest(value: float) -> str:
-    """Return the shortest text of a float64; whole numbers are written as in kapture."""
+    """Return the shortest text of a float64; whole numbers have no point, as in kapture."""
     value = float(value)
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
@@ -154,7 +161,7 @@ def _shortest(value: float) -> str:
 
 @contextlib.contextmanager
 def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterator[list[str]]]:
-    """Read rows of stripped fields, without comments; errors of the block name file and line."""
+    """Read rows of stripped fields, without comments; errors in the block name file and line."""
     with reading_lines(path) as lines:
         first = next(lines, "")
         check_version(path, first, required=version_required)
@@ -177,7 +184,7 @@ def check_columns(fields: Sequence[str], expected: int) -> None:
 
 
 def writable_name(name: str) -> str:
-    """Replace commas, outer spaces and a first #, which :func:`format_table` refuses, by ``_``."""
+    """Replace commas, outer spaces and a leading # by ``_``; :func:`format_table` rejects them."""
     name = name.replace(",", "_")
     middle = name.strip()
     left = len(name) - len(name.lstrip())
@@ -186,7 +193,7 @@ def writable_name(name: str) -> str:
 
 
 def check_field(name: str) -> str:
-    """Return an image name that is a plain path and a valid CSV field, else raise DataError."""
+    """Return an image name if it is a plain path and a valid CSV field; raise DataError if not."""
     check_relative(name)
     if "," in name or name != name.strip():
         raise DataError(f"image name {name!r} has a comma or a space at its end")

@@ -1,7 +1,8 @@
 """Tables in a kapture's ``sensors/``: sensors, rigs, trajectories and records.
 
-Floats are written with the digits that restore the same float64 (up to 17). kapture allows partial
-poses: rows with an entirely blank rotation or translation are skipped, other blanks are errors.
+Floats are written with as many digits (up to 17) as restore the same float64. kapture allows
+partial poses: rows whose whole rotation or whole translation is blank are skipped, other blanks are
+errors.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from megloc_kapture.io.kapture.format import (
 from megloc_kapture.io.text_lines import numbers_of
 from megloc_kapture.values import RigidTransform
 
-# |q| may differ from 1 by less than this (few digits in the text) and is normalised
+# a quaternion whose length differs from 1 by less than this (few digits in the text) is normalised
 MAX_QUATERNION_ERROR = 1e-3
-# |q| is one up to rounding: normalising would only change the last bits
+# a length within this of 1 is due to rounding; normalising would only change the last bits
 _QUATERNION_ROUNDING = 1e-14
 
 _POSE_COLUMNS = "qw, qx, qy, qz, tx, ty, tz"
@@ -86,7 +87,10 @@ def read_sensors(path: Path) -> dict[str, Sensor]:
 
 
 def check_sensor(sensor: Sensor) -> None:
-    """Refuse a camera or depth sensor with invalid intrinsics; ``UNKNOWN_CAMERA`` is valid."""
+    """Raise DataError for a camera or depth sensor with invalid intrinsics.
+
+    ``UNKNOWN_CAMERA`` with a valid size is accepted.
+    """
     if sensor.sensor_type not in CAMERA_SENSOR_TYPES:
         return
     if sensor.params[:1] != (UNKNOWN_CAMERA,):
@@ -136,7 +140,7 @@ def read_trajectories(
 def read_records(
     path: Path, sensors: dict[str, Sensor], sensor_type: str
 ) -> dict[tuple[int, str], str]:
-    """Read ``records_camera.txt`` or ``records_depth.txt``; a repeated path is refused."""
+    """Read ``records_camera.txt`` or ``records_depth.txt``; DataError for a repeated path."""
     records: dict[tuple[int, str], str] = {}
     names: set[str] = set()
     with read_rows(path) as rows:

@@ -1,9 +1,9 @@
 """Network weights: the registry of published checkpoints and the folder that holds them.
 
-``registry.toml`` lists each checkpoint's file, page, licence and sha256. The folder is
-MEGLOC_WEIGHTS or ``megloc-kapture/weights`` in the user's cache. Torch files (read with
-``weights_only=True``) and safetensors are supported; ``scripts/convert_weights.py`` converts
-others.
+``registry.toml`` lists each checkpoint's file, page, licence and sha256. The environment variable
+MEGLOC_WEIGHTS names the folder; the default is ``megloc-kapture/weights`` in the user's cache.
+Files of torch (read with ``weights_only=True``) and safetensors are supported;
+``scripts/convert_weights.py`` converts other formats.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     import torch
 
 FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
-UNVERIFIED = "unverified"  # folder of user files that replace published ones
+UNVERIFIED = "unverified"  # subfolder of user files, used if the published file is missing
 _REGISTRY = Path(__file__).with_name("registry.toml")
 # keys under which training scripts keep the state dict
 _STATE_KEYS = ("state_dict", "model_state", "model", "extractor")
@@ -64,7 +64,7 @@ class PublishedFile(Options):
 
     name: _FileName  # in the folder of weights
     also: tuple[_FileName, ...] = ()  # alternative names
-    url: _Url | None = None  # None: available only by hand from the network's page
+    url: _Url | None = None  # None: must be downloaded by hand from the network's page
     size: Annotated[int, Field(gt=0)] | None = None  # bytes
     sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
     convert: bool = False  # needs scripts/convert_weights.py
@@ -115,7 +115,7 @@ def by_sha256(sha256: str) -> tuple[Weights, PublishedFile] | None:
 
 
 def by_file_name(name: str) -> tuple[Weights, PublishedFile] | None:
-    """Find the network and file of a file name."""
+    """Find the network and the published file by a file name."""
     for weights, file in _all_files():
         if name in [path.rpartition("/")[2] for path in file.names]:
             return weights, file
@@ -130,7 +130,7 @@ def _all_files() -> list[tuple[Weights, PublishedFile]]:
 
 
 class MissingWeightsError(DataError):
-    """Missing checkpoints, with their sources and the command that adds each."""
+    """Missing checkpoints; the message has a line for each, with source and command to add it."""
 
     def __init__(
         self,
@@ -158,7 +158,7 @@ class WeightsFile:
 
     @property
     def published(self) -> PublishedFile | None:
-        """The registry's file expected here; None for user files and converted ones."""
+        """The published file that this should be; None for user files and converted files."""
         known = registry().get(self.name)
         if known is None or self.path.is_relative_to(weights_folder() / UNVERIFIED):
             return None
@@ -265,10 +265,11 @@ def sha256_of(file: WeightsFile) -> str:
 
 
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
-    """Read the tensors of a checkpoint by name, without ``module.``; none of its code runs.
+    """Read the tensors of a checkpoint by name, without the prefix ``module.``.
 
-    Files of ``torch.save`` are mapped, so that the workers of one machine share their memory;
-    ``load_strictly`` keeps tensors with ``is_shared_file``.
+    No code in the file is executed. Files of ``torch.save`` are memory-mapped, so that the workers
+    of one machine share the memory; ``nets.runtime.load_strictly`` recognises such tensors by
+    ``is_shared_file`` and does not copy them.
     """
     check_sha256(file, file.published)
     if file.path.suffix == ".safetensors":
@@ -284,7 +285,7 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
 
 
 def check_sha256(file: WeightsFile, published: PublishedFile | None) -> None:
-    """Raise DataError if the sha256 differs from the published one, where it is known."""
+    """Raise DataError if the sha256 of the published file is known and differs."""
     if published and published.sha256 and sha256_of(file) != published.sha256:
         raise DataError(
             f"is not the published {published.name} of {file.name}: sha256 {sha256_of(file)} "
@@ -298,7 +299,7 @@ def _load_torch(path: Path, mapped: bool) -> Any:
     import numpy as np
     import torch
 
-    # training scripts keep a score next to the weights (DeepLabV3+: best_score)
+    # some training scripts store a numpy scalar with the weights (DeepLabV3+: best_score)
     scalar = np._core.multiarray.scalar  # type: ignore[attr-defined]
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     of_scores: list[Any] = [np.dtype, type(np.dtype("f4")), type(np.dtype("f8"))]
@@ -332,7 +333,10 @@ Track = Callable[[Iterable[bytes], int, str], Iterable[bytes]]
 
 
 def fetch(url: str, path: Path, *, sha256: str | None = None, track: Track | None = None) -> None:
-    """Download a file, named once complete and verified; ``track`` shows chunks of 1 MB."""
+    """Download a file to ``path``, where it appears once it is complete and verified.
+
+    ``track`` shows the progress in chunks of 1 MB.
+    """
     import pooch
     import requests
 
@@ -368,7 +372,7 @@ def add_weights(
 ) -> WeightsFile:
     """Copy a file into the folder of weights under its registered name.
 
-    An ``unverified`` file may differ from the published one, and is used where that is missing.
+    An ``unverified`` file may differ from the published file and is used while that is missing.
     """
     require(source.is_file(), "no such file", path=source)
     described = describe(source.name, source)
@@ -401,7 +405,7 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
         raise OutputError(f"{output}: exists; -f replaces it")
     require(source.is_file(), "no such file", path=source)
     file = describe(source.name, source)
-    # views of shared memory are stored separately
+    # safetensors rejects tensors that share memory, so each is copied
     tensors = {name: tensor.contiguous().clone() for name, tensor in read_weights(file).items()}
     write_bytes(output, save(tensors, {SOURCE_KEY: sha256_of(file)}))
     return len(tensors)
