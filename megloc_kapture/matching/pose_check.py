@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,9 +17,11 @@ from megloc_kapture.values import RigidTransform
 # sensors have such errors
 _MAX_ERROR_SHARE = 0.02
 _AGREEING = 0.5  # the poses of a pair are correct if this share of its matches fits them
-# an image is wrong if a larger share of its pairs contradicts its pose, a map is wrong if a larger
-# share of its images is wrong
+# an image is wrong if a larger share of its matches contradicts its pose, a map is wrong if a
+# larger share of its images is wrong
 _MOST = 0.5
+# pairs with a smaller share of the usual number of matches may only look alike, and are left out
+_WEAK = 0.5
 _FEW = 3  # a map is rejected only if at least this many images are compared
 
 
@@ -93,19 +95,26 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
 def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
     """Return the images with contradicting poses, and the number of images with an agreeing pair.
 
-    A wrong pose also affects the pairs with images whose poses are correct, so the worst image is
-    removed first, repeatedly. A single pair is no evidence against an image.
+    A pair weighs as much as it has matches. Pairs that only look alike have few, and are left out
+    below half of the usual number, the median over the images of their largest number. A wrong pose
+    also affects the pairs with images whose poses are correct, so the worst image is removed first,
+    repeatedly. A single pair is no evidence against an image.
     """
-    number = Counter(image for pair in pairs for image in (pair.image, pair.other))
+    largest: dict[str, int] = {}
+    for pair in pairs:
+        for image in (pair.image, pair.other):
+            largest[image] = max(pair.num, largest.get(image, 0))
+    left = [pair for pair in pairs if pair.num >= _WEAK * np.median(list(largest.values()))]
+    number = Counter(image for pair in left for image in (pair.image, pair.other))
     wrong: list[str] = []
-    left = list(pairs)
     while True:
-        contradict: dict[str, list[bool]] = defaultdict(list)
+        compared, contradicting = Counter[str](), Counter[str]()
         for pair in left:
             for image in (pair.image, pair.other):
                 if number[image] > 1:
-                    contradict[image].append(not pair.agrees)
-        shares = [(np.mean(of_image), len(of_image), i) for i, of_image in contradict.items()]
+                    compared[image] += pair.num
+                    contradicting[image] += 0 if pair.agrees else pair.num
+        shares = [(contradicting[image] / num, num, image) for image, num in compared.items()]
         share, _, worst = max(shares, default=(0.0, 0, ""))
         if share <= _MOST:
             agreeing = {i for pair in left if pair.agrees for i in (pair.image, pair.other)}

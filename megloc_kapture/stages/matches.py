@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -231,19 +231,28 @@ def check_given_poses(
 
 
 def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
-    """Sample pairs within groups of similar images; the groups are spread over the map."""
-    paired: dict[str, list[str]] = {}
-    for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.query, pair.map)):
-        paired.setdefault(pair.query, []).append(pair.map)
-        paired.setdefault(pair.map, []).append(pair.query)
-    chosen: dict[str, set[str]] = {}
-    images = sorted(paired)
+    """Sample pairs within groups of similar images; the groups are spread over the map.
+
+    Among pairs of equal score, images with close positions in the sorted list count as more
+    similar, as they are often consecutive. Each image of a group is also paired with the image most
+    similar to it, since the group may only look alike.
+    """
+    images = sorted({image for pair in pairs for image in (pair.query, pair.map)})
+    position = {image: at for at, image in enumerate(images)}
+    ranked: dict[str, list[tuple[float, int, str]]] = defaultdict(list)
+    for pair in pairs:
+        apart = abs(position[pair.query] - position[pair.map])
+        ranked[pair.query].append((-pair.score, apart, pair.map))
+        ranked[pair.map].append((-pair.score, apart, pair.query))
+    similar = {image: [other for *_, other in sorted(ranked[image])] for image in images}
+    chosen: dict[str, set[str]] = defaultdict(set)
     for image in images[:: max(1, math.ceil(len(images) / _CHECKED_GROUPS))]:
-        ranked = list(dict.fromkeys(paired[image]))
-        others = {ranked[rank] for rank in _RANKS if rank < len(ranked)}
-        for a, b in combinations(sorted({image, *others}), 2):
-            chosen.setdefault(a, set()).add(b)
-    return [(image, sorted(others)) for image, others in chosen.items()]
+        others = list(dict.fromkeys(similar[image]))
+        group = {image, *(others[rank] for rank in _RANKS if rank < len(others))}
+        most_similar = ((member, similar[member][0]) for member in group)
+        for a, b in map(sorted, (*combinations(group, 2), *most_similar)):
+            chosen[a].add(b)
+    return [(image, sorted(others)) for image, others in sorted(chosen.items())]
 
 
 def _evidence(

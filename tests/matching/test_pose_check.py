@@ -140,6 +140,31 @@ def test_repeated_structure_is_no_contradiction() -> None:
     assert alike != pairs and pose_contradiction(alike) is None
 
 
+@pytest.mark.parametrize(("num", "contradicts"), [((30, 30), False), ((42, 42), False),
+                                                  ((60, 60), True)])  # fmt: skip
+def test_pairs_that_may_only_look_alike_weigh_little(
+    num: tuple[int, int], contradicts: bool
+) -> None:
+    """Pairs usually have 80 matches; the last image has 90 that fit in one pair, ``num`` do not."""
+    right = poses_around(4)
+    pairs = evidence(right, list(map(transform, right)))
+    none = (0,) * len(pairs[0].fitting)
+    pairs.append(PairEvidence("3.jpg", "last.jpg", 90, (90, *none[1:])))
+    for at, matches in enumerate(num):
+        pairs.append(PairEvidence(f"{at}.jpg", "last.jpg", matches, none))
+    contradiction = pose_contradiction(pairs)
+    assert (contradiction is not None) == contradicts
+    assert contradiction is None or "1 of 5 compared images" in contradiction[0]
+
+
+def test_an_image_of_weak_pairs_alone_is_not_judged() -> None:
+    right = poses_around(4)
+    pairs = evidence(right, list(map(transform, right)))
+    none = (0,) * len(pairs[0].fitting)
+    pairs += [PairEvidence(f"{at}.jpg", "last.jpg", 30, none) for at in range(3)]
+    assert pose_contradiction(pairs) is None
+
+
 def test_two_images_are_too_few_to_refuse_a_map() -> None:
     """Unless a wrong convention explains the contradiction."""
     right = poses_around(2)

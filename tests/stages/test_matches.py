@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from megloc_kapture.matching.nearest_neighbours import NearestNeighbours, match_
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.matches import (
+    _sampled,
     best_pairs,
     check_given_poses,
     iterate_candidates,
@@ -135,6 +137,18 @@ def test_candidates_are_sorted_by_score_and_name() -> None:
     assert list(iterate_candidates(pairs)) == [("q1", ["m2", "m1", "m3"]), ("q2", ["m1"])]
 
 
+def test_sampled_pairs_include_the_most_similar_image_of_each() -> None:
+    """Of equal scores, the pair of neighbours in the sorted list."""
+    names = [f"{at:03}" for at in range(60)]
+    pairs = [ImagePair(b, a, 1.0) for a, b in itertools.combinations(names, 2)]
+    sampled = {(image, other) for image, others in _sampled(pairs) for other in others}
+    images = {image for pair in sampled for image in pair}
+    assert 6 * 6 <= len(images) <= 6 * 12
+    for image in images:
+        apart = [abs(int(a) - int(b)) for a, b in sampled if image in (a, b)]
+        assert min(apart) == 1
+
+
 @pytest.mark.parametrize(
     ("rotated", "message"), [(0, ""), (1, "matches: left/0.png"), (3, "No usual")]
 )
@@ -148,7 +162,7 @@ def test_wrong_given_poses_are_reported(
         poses[key] = replace(poses[key], quat_wxyz=tuple((quat / np.linalg.norm(quat)).tolist()))
     write_sensors(tmp_path, replace(data, trajectories=poses))
     mapping, images = KaptureFolder(tmp_path, features_dirs=[world.features_dir]), world.map_poses
-    pairs = all_pairs(sorted(images), sorted(images))
+    pairs = [ImagePair(a, b, 1.0) for a, b in itertools.combinations(sorted(images), 2)]
 
     def check(force: bool) -> None:
         check_given_poses(mapping, pairs, "rootsift", NearestNeighbours(), Work(force=force))
