@@ -87,9 +87,9 @@ def ids(*values: int) -> np.ndarray:
 
 
 def test_coverage_prefers_images_that_add_more_points() -> None:
-    images = [ids(0, 1, 2, 3), ids(0, 1, 2), ids(7, 8), ids()]
+    images = [ids(0, 1, 2, 3), ids(0, 1), ids(7, 8), ids(1, 2, 3)]
     assert greedy_coverage(images, 2) == ([0, 2], [4, 2])
     # images that add nothing follow in order of their matches, then of their index
-    assert greedy_coverage(images, 9) == ([0, 2, 1, 3], [4, 2, 0, 0])
+    assert greedy_coverage(images, 9) == ([0, 2, 3, 1], [4, 2, 0, 0])
     assert greedy_coverage([ids(), ids()], 9) == ([0, 1], [0, 0])
     assert greedy_coverage([], 3) == ([], [])
