@@ -22,6 +22,8 @@ from starlette.testclient import TestClient
 from megloc_kapture import Localizer, Pose
 from megloc_kapture.api import Map
 from megloc_kapture.errors import DataError
+from megloc_kapture.service.app import Answer
+from megloc_kapture.values import RigidTransform
 
 # of the machine: no answer has one in it
 PATH = re.compile(r"/(home|root|usr|tmp|work|var|opt)/|\.py\b|Traceback")
@@ -85,6 +87,12 @@ def test_answers_equal_the_localizer(
     model = api["components"]["schemas"]["Answer"]
     assert set(body) == set(model["properties"]) == set(model["required"])
     assert set(camera) == set(api["components"]["schemas"]["CameraModel"]["required"])
+
+
+def test_an_answer_counts_matches_and_inliers_and_names_the_frame(photos: list[Photo]) -> None:
+    pose = Pose(RigidTransform.identity(), 9, 7)
+    answer = Answer.of(pose, photos[0].camera, "DUC1")
+    assert (answer.num_matches, answer.num_inliers, answer.frame) == (9, 7, "DUC1")
 
 
 @pytest.mark.parametrize(("orientation", "focal_35mm"), [(6, 27), (1, None)])
