@@ -179,8 +179,6 @@ def test_a_twin_has_the_options_of_its_dataset_without_published_figures() -> No
     ("content", "message"),
     [
         (b"dataset = ", "b.toml: not TOML: "),
-        (b"", "b.toml: dataset: "),
-        (b'dataset = "x"\npreset_of = "y"\n', "b.toml: preset_of: "),
         (b'dataset = "x"\n[presets.best]\n', "b.toml: presets: .*unknown preset 'best'; known: "),
     ],
 )
@@ -214,19 +212,19 @@ def test_depth_without_a_rig_is_reported_and_not_used(
 
 
 @pytest.mark.parametrize(
-    ("preset", "with_depth", "rank", "refiners"),
+    ("with_depth", "rank", "refiners"),
     [
-        ("megloc", (), None, []),
-        ("megloc", ("mapping",), "lpips", ["rendering"]),
-        ("megloc", ("query",), None, ["icp"]),
-        ("megloc", ("mapping", "query"), "lpips", ["icp", "rendering"]),
+        ((), None, []),
+        (("mapping",), "lpips", ["rendering"]),
+        (("query",), None, ["icp"]),
+        (("mapping", "query"), "lpips", ["icp", "rendering"]),
     ],
 )
 def test_depth_of_kapture_folders_adds_steps_to_a_preset(
-    tmp_path: Path, preset: str, with_depth: Sequence[str], rank: str | None, refiners: list[str]
+    tmp_path: Path, with_depth: Sequence[str], rank: str | None, refiners: list[str]
 ) -> None:
     for part in ("mapping", "query"):
         write_part(tmp_path / part, depth=part in with_depth)
-    options = choose_run("kapture", tmp_path, preset=preset).options
+    options = choose_run("kapture", tmp_path, preset="megloc").options
     distance = options.localization.rank.options.get("distance", {}).get("name")
     assert (distance, [one.name for one in options.pose_refinement.by]) == (rank, refiners)

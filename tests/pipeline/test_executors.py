@@ -32,11 +32,6 @@ def test_inline_and_one_worker_need_no_pool() -> None:
             assert executor is None
 
 
-def test_less_than_one_worker_is_refused() -> None:
-    with pytest.raises(OptionError, match="0 workers"), open_executor("inline", 0):
-        pass
-
-
 def _log_level() -> int:
     return logging.getLogger().level
 
@@ -116,8 +111,13 @@ def running(folder: Path, number: int = 2) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with running(tmp_path_factory.mktemp("cluster")) as found:
-        yield found
+    with (
+        running(tmp_path_factory.mktemp("cluster")) as address,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        # every process would import torch for its version
+        patch.setattr(dask_executor, "_PACKAGES", ["megloc_kapture", "numpy"])
+        yield address
 
 
 def _slow_square(number: int) -> tuple[int, int]:
@@ -168,12 +168,16 @@ def test_folders_that_workers_cannot_read_are_refused(
         pytest.fail("opened")
 
 
-def test_a_wrong_address_is_refused(cluster: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_executor, "_CONNECT_S", 1.0)
+def test_wrong_addresses_and_numbers_of_workers_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dask_executor, "_CONNECT_S", 0.2)
     with (
         pytest.raises(OptionError, match="no dask scheduler at tcp://127.0.0.1:1$"),
         open_executor("dask", scheduler="tcp://127.0.0.1:1"),
     ):
         pass
     with pytest.raises(OptionError, match="--scheduler"):
-        open_executor("processes", 2, cluster).__enter__()
+        open_executor("processes", 2, "tcp://127.0.0.1:1").__enter__()
+    with pytest.raises(OptionError, match="0 workers"):
+        open_executor("inline", 0).__enter__()

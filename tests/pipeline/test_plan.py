@@ -1,9 +1,9 @@
-"""Plans run the stages that are not up to date; failed stages leave the old outputs."""
+"""Plans run the stages that are not up to date, in a workspace that has one run at a time."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -12,9 +12,18 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.pipeline.plan import StageReport, Workspace, all_kept, describe, run_plan
-from megloc_kapture.stages.stage import Stage, StageWork
+from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.io.files import temporary_name
+from megloc_kapture.pipeline.plan import (
+    StageReport,
+    Workspace,
+    all_kept,
+    describe,
+    fingerprint,
+    read_manifest,
+    run_plan,
+)
+from megloc_kapture.stages.stage import Stage, StageWork, files_fingerprint
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options
 
@@ -63,7 +72,7 @@ class Plan:
         first: dict[str, Any] = {"version": self.version, "outside": self.external}
         return [
             Step("a", (), ("a.txt",), self.do("a"), settings=a, **first),
-            Step("b", ("a.txt",), ("b", "b.csv"), self.do("b", "a.txt"), settings=b),
+            Step("b", ("a.txt",), ("b",), self.do("b", "a.txt"), settings=b),
             Step("c", ("a.txt", "b/b.txt"), ("c.txt",), self.do("c", "b/b.txt"), settings=c),
         ]
 
@@ -74,11 +83,8 @@ class Plan:
             place = out / "b" / "b.txt" if name == "b" else out / f"{name}.txt"
             place.parent.mkdir(exist_ok=True)
             place.write_text(text + name + str(self.options[name].get("extra", "")))
-            if self.options[name].get("csv"):
-                (out / "b.csv").write_text("table")
-            if command := self.options[name].get("killed"):
-                assert subprocess.run([*command, str(place)], check=False).returncode == 9
-                assert len(list(place.parent.iterdir())) == 2
+            if self.options[name].get("worker_dies"):
+                (place.parent / temporary_name()).write_text("half")
             if self.options[name].get("fails"):
                 raise DataError("it fails")
             return {"letters": float(len(text) + 1)}
@@ -153,17 +159,6 @@ def test_changed_stages_run_again(
     assert all_kept(plan.run())
 
 
-def test_an_output_that_is_no_longer_written_is_removed(plan: Plan) -> None:
-    plan.options["b"] = {"csv": True}
-    plan.run()
-    assert plan.workspace.path("b.csv").is_file()
-    assert all_kept(plan.run())
-    plan.options["b"] = {}
-    plan.run()
-    assert not plan.workspace.path("b.csv").exists()
-    assert all_kept(plan.run())
-
-
 def test_an_output_of_another_stage_under_other_options_is_made_again(tmp_path: Path) -> None:
     workspace, output = Workspace(tmp_path / "w"), tmp_path / "w" / "images.txt"
 
@@ -203,9 +198,7 @@ def test_files_of_killed_runs_and_workers_are_not_published(plan: Plan) -> None:
     rest = plan.workspace.path(".partial/b/b")
     rest.mkdir(parents=True)
     (rest / "rest.txt").write_text("half")
-    dying = "from megloc_kapture.io.files import *; import os, sys\n"
-    dying += "with atomic_write(sys.argv[1]) as file: file.write(b'half'); os._exit(9)"
-    plan.options["b"]["killed"] = [sys.executable, "-c", dying]
+    plan.options["b"]["worker_dies"] = True
     with ThreadPoolExecutor(1) as executor:
         plan.run(work=Work(executor))
     assert [p.name for p in plan.workspace.path("b").iterdir()] == ["b.txt"]
@@ -274,7 +267,6 @@ def test_a_dry_run_runs_nothing(plan: Plan) -> None:
     plan.options["b"] = {"extra": "!"}
     reports = plan.run(dry_run=True)
     assert [r.state for r in reports] == ["kept", "pending", "pending"]
-    reports = plan.run(dry_run=True, first="b")
     assert plan.log == []
     plan.options["b"] = {}
     assert all_kept(plan.run())
@@ -285,11 +277,106 @@ def test_a_dry_run_runs_nothing(plan: Plan) -> None:
     [
         ("keypoints", 33_485_000, "33,485,000 keypoints"),
         ("queries_with_truth", 1, "1 query with truth"),
-        ("max_size_px", 1600, "max size: 1,600 px"),
         ("mean_reprojection_error_px", 0.74219, "mean reprojection error: 0.7422 px"),
         ("recall within 0.25 m and 2 deg percent", 87.5, "recall within 0.25 m and 2 deg: 87.5 %"),
     ],
 )
 def test_counts_read_as_english(name: str, value: float, text: str) -> None:
     assert describe(StageReport("a", "run", 0.04, {name: value}, "")) == f"a: {text}; 0.0 s"
-    assert describe(StageReport("a", "run", 0.04, {}, "")) == "a: 0.0 s"
+
+
+# ---------------------------------------------------------------------------------- workspaces
+
+
+def use(workspace: Workspace) -> None:
+    """Publish the output of a stage."""
+    with workspace.lock(), workspace.staging("a", "1") as out:
+        (out / "a.txt").write_text("a")
+        workspace.publish(out, ("a.txt",))
+
+
+def test_a_workspace_is_reused_and_an_empty_one_removed(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "runs" / "w")
+    with workspace.lock(), workspace.staging("a", "1") as out:
+        (out / "a.txt").write_text("a")
+    assert list((tmp_path / "runs").iterdir()) == []
+    use(Workspace(tmp_path / "w"))
+    with Workspace(tmp_path / "w").lock():
+        pass
+    assert (tmp_path / "w" / "a.txt").read_text() == "a"
+
+
+def test_other_folders_are_used_only_by_force(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(OutputError, match="not a workspace of megloc"):
+        Workspace(tmp_path)
+    use(Workspace(tmp_path, force=True))
+    Workspace(tmp_path)
+    assert (tmp_path / "thesis.txt").read_text() == "mine"
+
+
+def test_a_workspace_has_one_run_at_a_time(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "w")
+    use(workspace)
+    with workspace.lock():
+        other = Workspace(workspace.root).lock()
+        with pytest.raises(OutputError, match="another run is using this workspace"):
+            other.__enter__()
+
+
+def test_publishing_replaces_outputs_and_keeps_linked_folders(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "w")
+    outputs = ("sub/folder", "file.txt", "other.txt")
+    for number in "12":
+        with workspace.lock(), workspace.staging("a", "1") as out:
+            (out / "sub" / "folder").mkdir(parents=True)
+            (out / "sub" / "folder" / number).touch()
+            (out / ("file.txt" if number == "1" else "other.txt")).write_text(number)
+            workspace.publish(out, outputs)
+    assert [p.name for p in (workspace.root / "sub" / "folder").iterdir()] == ["2"]
+    assert not (workspace.root / "file.txt").exists()
+    assert (workspace.root / "other.txt").read_text() == "2"
+
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "file").touch()
+    (workspace.root / "folder").symlink_to(mine)
+    with workspace.lock(), workspace.staging("a", "1") as out:
+        (out / "folder").mkdir()
+        workspace.publish(out, ("folder",))
+    assert [p.name for p in mine.iterdir()] == ["file"]
+
+
+def test_a_fingerprint_depends_on_content_and_not_on_order() -> None:
+    options = {"pair": (1, 2), "text": "x", "deep": {"a": 0.5, "b": [None, True]}}
+    mark = fingerprint("s", 1, options, {"a": "1"})
+    assert fingerprint("s", 1, dict(reversed(options.items())), {"a": "1"}) == mark
+    # as read from a manifest
+    assert fingerprint("s", 1, json.loads(json.dumps(options)), {"a": "1"}) == mark
+    changed = {
+        fingerprint("t", 1, options, {"a": "1"}),
+        fingerprint("s", 2, options, {"a": "1"}),
+        fingerprint("s", 1, options | {"pair": (2, 1)}, {"a": "1"}),
+        fingerprint("s", 1, options, {"a": "2"}),
+        fingerprint("s", 1, options, {"b": "1"}),
+    }
+    assert mark not in changed and len(changed) == 5
+
+
+@pytest.mark.parametrize("content", [b"", b'{"stage": "s"}', b"\xff\xfe"])
+def test_a_missing_or_damaged_manifest_is_ignored(tmp_path: Path, content: bytes) -> None:
+    assert read_manifest(tmp_path / "s.json") is None
+    (tmp_path / "s.json").write_bytes(content)
+    assert read_manifest(tmp_path / "s.json") is None
+
+
+def test_a_fingerprint_of_files_depends_on_names_sizes_and_times(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / name).write_text(name)
+    before = files_fingerprint(tmp_path, [tmp_path / "a", tmp_path / "b"])
+    assert files_fingerprint(tmp_path, [tmp_path / "b", tmp_path / "a"]) == before
+    assert files_fingerprint(tmp_path, [tmp_path / "a"]) != before
+    os.utime(tmp_path / "b", ns=(1, 1))
+    assert files_fingerprint(tmp_path, [tmp_path / "a", tmp_path / "b"]) != before
+    with pytest.raises(DataError, match="gone: cannot be read"):
+        files_fingerprint(tmp_path, [tmp_path / "gone"])

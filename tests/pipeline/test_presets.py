@@ -6,7 +6,7 @@ from operator import attrgetter
 
 import pytest
 
-from megloc_kapture.errors import DataError, OptionError, PluginError
+from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.pipeline.presets import (
     PRESETS,
     PipelineOptions,
@@ -34,12 +34,9 @@ def test_assignments_and_tables_are_equivalent_and_the_last_counts() -> None:
     ("text", "value"),
     [
         ("none", "none"),
-        ("null", None),
         ("3", 3),
-        ("0.5", 0.5),
         ("true", True),
         ('"quoted"', "quoted"),
-        ("plain", "plain"),
         ("[1, 2]", [1, 2]),
         ("a=b", "a=b"),
     ],
@@ -74,9 +71,7 @@ SEVERAL = 'local_features=["sift", "rootsift"]'
         (["querypairs.top_k=3"], r"option querypairs; did you mean query_pairs\?"),
         (["query_pairs.topk=3"], r"query_pairs.topk; did you mean query_pairs.top_k\?"),
         (["query_pairs.top_k=many"], "option query_pairs.top_k: "),
-        (["verification=maybe"], "option verification: .*'geometric', 'mapping' or 'none'"),
         (["device=gpu"], "option device: "),
-        (["local_features=[]"], "local_features: .*at least 1 item"),
         (
             [SEVERAL, "local_features.options.max_keypoints=7"],
             r"choose one of: local_features\.sift, local_f",
@@ -86,11 +81,6 @@ SEVERAL = 'local_features=["sift", "rootsift"]'
 def test_invalid_assignments_are_refused(assignments: list[str], message: str) -> None:
     with pytest.raises(OptionError, match=message):
         options_of_preset(assignments=assignments)
-
-
-def test_an_unknown_preset_lists_the_known() -> None:
-    with pytest.raises(OptionError, match="unknown preset 'best'; known: classic, megloc, modern"):
-        options_of_preset("best")
 
 
 @pytest.mark.parametrize(
@@ -119,16 +109,13 @@ def test_local_features_are_a_name_or_a_list(
     assert options.main_type() == next(iter(expected))
 
 
-def test_repeated_types_are_refused() -> None:
+def test_unknown_presets_and_repeated_types_are_refused() -> None:
+    with pytest.raises(OptionError, match="unknown preset 'best'; known: classic, megloc, modern"):
+        options_of_preset("best")
     with pytest.raises(OptionError, match="global features 'vlad_rootsift' are listed twice"):
         options_of_preset(assignments=['global_features=["vlad","vlad"]']).retrieval()
     with pytest.raises(OptionError, match="'sift' is listed twice"):
         options_of_preset(assignments=['local_features=["sift", "sift"]']).local_types()
-
-
-def test_missing_weights_have_a_download_command() -> None:
-    with pytest.raises(DataError, match=r"aliked-n16.pth .*https://.*megloc weights fetch"):
-        options_of_preset("modern").make_extractors()
 
 
 def test_plugins_are_made_with_their_options() -> None:

@@ -15,7 +15,6 @@ from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import image_size, read_image_rgb, read_photo, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.output_folders import claim_folder
 from megloc_kapture.io.text_lines import read_cameras
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -47,20 +46,6 @@ def test_names_are_paths_below_the_given_folders(tmp_path: Path) -> None:
     assert ".nef cannot be read" in photos.unreadable["raw.NEF"].lower()
 
 
-def test_links_are_followed_once_and_our_folders_left_out(tmp_path: Path) -> None:
-    photos = tmp_path / "photos"
-    write(photos / "1.jpg")
-    write(tmp_path / "elsewhere" / "3.jpg")
-    (photos / "a link").symlink_to(tmp_path / "elsewhere")
-    (photos / "loop").symlink_to(photos)
-    claim_folder(photos / "map", kind="workspace")
-    write(photos / "map" / "mapping" / "sensors" / "records_data" / "1.jpg")
-    (photos / "kapture" / "sensors").mkdir(parents=True)
-    (photos / "kapture" / "sensors" / "sensors.txt").touch()
-    write(photos / "kapture" / "sensors" / "records_data" / "1.jpg")
-    assert Photographs([photos]).names == ["1.jpg", "a link/3.jpg"]
-
-
 def test_images_of_one_size_and_focal_length_share_a_camera(tmp_path: Path) -> None:
     write(tmp_path / "1.jpg", focal_35mm=28)
     write(tmp_path / "2.jpg", focal_35mm=28)
@@ -90,9 +75,8 @@ def test_rotated_photographs_are_turned_without_a_given_camera(tmp_path: Path) -
 
 
 def test_frames_of_a_video(tmp_path: Path) -> None:
-    film = cv2.VideoWriter(
-        str(tmp_path / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48)
-    )
+    code = cv2.VideoWriter.fourcc(*"MJPG")
+    film = cv2.VideoWriter(str(tmp_path / "walk.avi"), code, 10, (64, 48))
     for number in range(25):
         film.write(np.full((48, 64, 3), 5 * number, np.uint8))
     film.release()
@@ -105,13 +89,7 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
         assert abs(int(image.mean()) - 5 * number) <= 2
 
 
-@pytest.mark.parametrize("name", ["Paris, Texas.jpg", "#1.jpg"])
-def test_a_name_that_kapture_cannot_hold_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(DataError, match="rename the file"):
-        Photographs([write(tmp_path / name)])
-
-
-def test_unusable_folders_are_refused(tmp_path: Path) -> None:
+def test_unusable_files_and_folders_are_refused(tmp_path: Path) -> None:
     one, two = write(tmp_path / "a" / "x.jpg"), write(tmp_path / "b" / "x.jpg")
     (tmp_path / "empty").mkdir()
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24")
@@ -120,6 +98,8 @@ def test_unusable_folders_are_refused(tmp_path: Path) -> None:
         ([tmp_path / "nowhere"], "no such file"),
         ([tmp_path / "empty"], "no image or video"),
         ([tmp_path / "cameras.txt"], "give a list of cameras with --camera"),
+        ([write(tmp_path / "Paris, Texas.jpg")], "rename the file"),
+        ([write(tmp_path / "#1.jpg")], "rename the file"),
     ):
         with pytest.raises(DataError, match=message):
             Photographs(paths)
@@ -171,63 +151,56 @@ def test_photographs_of_a_kapture_folder_have_its_cameras(tmp_path: Path) -> Non
 
 
 FEW = "local_features.rootsift.options.max_keypoints=300"
-PYRAMID = ("guided_pyramid.mode=all", "guided_pyramid.scales=[0.5,1.0]")
-TYPES = ("rootsift", "rootsift-pyramid")
+PYRAMID = ("mode=all", "scales=[0.5]", "rotations_deg=[0]", "min_matches=100")
 
 
 @pytest.fixture(scope="module")
-def workspaces(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Workspace]:
-    """Runs without and with guided pyramids, by the type of their map."""
-    root = tmp_path_factory.mktemp("pyramids")
-    plain, guided = (options_of_preset(assignments=[FEW, *more]) for more in ((), PYRAMID))
-    return {
-        "rootsift": evaluated(root / "rootsift", scene, plain, last="map"),
-        "rootsift-pyramid": evaluated(root / "pyramid", scene, guided, last="localization"),
-    }
+def guided(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A run with guided pyramids."""
+    options = options_of_preset(assignments=[FEW, *(f"guided_pyramid.{one}" for one in PYRAMID)])
+    root = tmp_path_factory.mktemp("pyramid") / "workspace"
+    return evaluated(root, scene, options, last="query_pyramid")
 
 
-@pytest.mark.parametrize(("of_map", "brought"), [TYPES, TYPES[::-1]])
+@pytest.fixture
+def queries(workspace: Path, tmp_path: Path) -> tuple[KaptureMap, KaptureFolder]:
+    """A map, and a copy of its queries without features."""
+    query = Path(shutil.copytree(workspace / "query", tmp_path / "query"))
+    return KaptureMap.open(workspace / "map"), KaptureFolder(query)
+
+
+@pytest.mark.parametrize("type_of_map", ["rootsift", "rootsift-pyramid"])
 def test_features_with_and_without_pyramid_are_interchangeable(
-    workspaces: dict[str, Workspace], tmp_path: Path, of_map: str, brought: str
+    workspace: Path, guided: Workspace, tmp_path: Path, type_of_map: str
 ) -> None:
-    place = workspaces["rootsift-pyramid"]
     query = tmp_path / "query"
-    shutil.copytree(place.path("query") / "sensors", query / "sensors", symlinks=True)
+    shutil.copytree(workspace / "query" / "sensors", query / "sensors", symlinks=True)
     (query / "sensors" / "records_data").unlink()  # without images nothing is extracted
-    features = place.root if brought == "rootsift" else place.path("pyramid/query")
-    folder = KaptureFolder(query, features_dirs=[features])
-    opened = KaptureMap.open(workspaces[of_map].path("map"))
-    assert list(opened.keypoints) == [of_map]
+    if type_of_map == "rootsift":
+        place, features = workspace / "map", guided.path("pyramid/query")
+    else:
+        place, features = guided.path("map"), workspace
+    folder, opened = KaptureFolder(query, features_dirs=[features]), KaptureMap.open(place)
+    assert list(opened.keypoints) == [type_of_map]
     queries = KaptureQueries(folder, opened)
-    assert queries.lacking(of_map) is None
+    assert queries.lacking(type_of_map) is None
     assert queries.lacking("superpoint") == queries.names[0]
     results = Results(Localizer(opened, options=options_of_preset(assignments=[FEW])), folder)
     assert all(results.values())
 
 
-def test_images_without_stored_features_are_named(
-    workspaces: dict[str, Workspace], tmp_path: Path
-) -> None:
-    place = workspaces["rootsift"]
-    features = Path(shutil.copytree(place.path("local_features"), tmp_path / "local_features"))
-    name = place.folder("query").read().image_names()[2]
+def test_images_without_stored_features_are_named(workspace: Path, tmp_path: Path) -> None:
+    features = Path(shutil.copytree(workspace / "local_features", tmp_path / "local_features"))
+    name = KaptureFolder(workspace / "query").read().image_names()[2]
     for suffix in ("kpt", "desc"):
         (found,) = features.rglob(f"{name}.{suffix}")
         found.unlink()
-    folder = KaptureFolder(place.path("query"), features_dirs=[tmp_path])
-    assert KaptureQueries(folder, KaptureMap.open(place.path("map"))).lacking("rootsift") == name
-
-
-@pytest.fixture
-def queries(workspaces: dict[str, Workspace], tmp_path: Path) -> tuple[KaptureMap, KaptureFolder]:
-    """A map, and a copy of its queries without features."""
-    place = workspaces["rootsift"]
-    query = Path(shutil.copytree(place.path("query"), tmp_path / "query"))
-    return KaptureMap.open(place.path("map")), KaptureFolder(query)
+    folder = KaptureFolder(workspace / "query", features_dirs=[tmp_path])
+    assert KaptureQueries(folder, KaptureMap.open(workspace / "map")).lacking("rootsift") == name
 
 
 def test_the_focal_length_of_an_uncalibrated_camera_is_estimated(
-    queries: tuple[KaptureMap, KaptureFolder], workspaces: dict[str, Workspace]
+    queries: tuple[KaptureMap, KaptureFolder], workspace: Path
 ) -> None:
     opened, folder = queries
     data = folder.read()
@@ -238,11 +211,11 @@ def test_the_focal_length_of_an_uncalibrated_camera_is_estimated(
     del data.records_camera[timestamp, sensor]
     data.records_camera[timestamp, "unknown"] = first
     write_sensors(folder.root, replace(data, sensors={**data.sensors, "unknown": unknown}))
-    folder = KaptureFolder(folder.root, features_dirs=[workspaces["rootsift"].root])
+    folder = KaptureFolder(folder.root, features_dirs=[workspace])
     results = Results(Localizer(opened, options=options_of_preset(assignments=[FEW])), folder)
     found = results[first]
     assert isinstance(found, Pose) and found.camera is not None
-    assert abs(found.camera.params[0] / known.params[0] - 1) < 0.05
+    assert abs(found.camera.params[0] / known.params[0] - 1) < 0.1  # the guess is 480 px, not 300
     others = [one for name, one in results.items() if name != first]
     assert all(isinstance(one, Pose) and one.camera is None for one in others)
     counts = results.save(folder.root.parent / "out")
@@ -280,10 +253,10 @@ def test_cameras_are_scaled_to_smaller_images(
 
 
 def test_other_spellings_of_a_type_are_recognised(
-    queries: tuple[KaptureMap, KaptureFolder], workspaces: dict[str, Workspace], tmp_path: Path
+    queries: tuple[KaptureMap, KaptureFolder], workspace: Path, tmp_path: Path
 ) -> None:
     opened, folder = queries
-    source = workspaces["rootsift"].root / "local_features" / "rootsift"
+    source = workspace / "local_features" / "rootsift"
     shutil.copytree(source, tmp_path / "features" / "local_features" / "RootSIFT")
     folder = KaptureFolder(folder.root, features_dirs=[tmp_path / "features"])
     assert KaptureQueries(folder, opened).lacking("rootsift") is None

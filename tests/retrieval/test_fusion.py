@@ -1,16 +1,12 @@
-"""Fusion against kapture-localization, and properties of ranks and coverage."""
+"""Fusion against kapture-localization, and ranks and coverage by hand."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections import defaultdict
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
@@ -62,15 +58,6 @@ def test_the_generalized_harmonic_mean_is_at_least_minus_gamma() -> None:
     np.testing.assert_allclose(fused[0, 3], expected, atol=1e-9)
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from(OPERATORS))
-def test_more_similar_is_never_worse(seed: int, options: FusionOptions) -> None:
-    rng = np.random.default_rng(seed)
-    matrices = [rng.uniform(-1, 1, (1, 8)) for _ in range(3)]
-    better = [matrix + rng.uniform(0, 0.5, matrix.shape) for matrix in matrices]
-    weights = rng.uniform(0.1, 3, 3).tolist()
-    assert (fuse(better, options, weights) >= fuse(matrices, options, weights) - 1e-12).all()
-
-
 def test_early_fusion_is_the_weighted_mean_of_cosines_in_float32() -> None:
     cosines = list(np.random.default_rng(0).uniform(-1, 1, (2, 3, 9)).astype(np.float32))
     fused = fuse(cosines, FusionOptions(method="early"), [3, 1])
@@ -84,41 +71,15 @@ def test_invalid_weights_are_refused(weights: list[float]) -> None:
         fuse([np.zeros((2, 4), np.float32)] * 2, FusionOptions(), weights)
 
 
-@st.composite
-def ranked_lists(draw: st.DrawFn) -> list[NDArray[np.int64]]:
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    queries, lists = draw(st.integers(0, 4)), []
-    for _ in range(draw(st.integers(1, 4))):
-        length = draw(st.integers(0, 8))
-        ranked = np.full((queries, length), -1, dtype=np.int64)
-        for row in ranked:
-            count = rng.integers(0, length + 1)
-            row[:count] = rng.permutation(10)[:count]
-        lists.append(ranked)
-    return lists
-
-
-@given(ranked_lists(), st.integers(1, 12))
-def test_reciprocal_ranks_add_up(lists: list[NDArray[np.int64]], top_k: int) -> None:
-    weights = [float(k + 1) for k in range(len(lists))]
-    indices, scores = fuse_rankings(lists, top_k, weights)
-    for row in range(len(lists[0])):
-        points: defaultdict[int, float] = defaultdict(float)
-        for ranked, weight in zip(lists, weights, strict=True):
-            for rank, image in enumerate(ranked[row].tolist()):
-                if image >= 0:
-                    points[image] += weight / sum(weights) / (60 + rank + 1)
-        best = sorted(points, key=lambda image: (-round(points[image], 12), image))[:top_k]
-        result = [image for image in indices[row].tolist() if image >= 0]
-        assert len(result) == len(best)
-        # rounding may change the order of equal sums, so points are compared
-        np.testing.assert_allclose([points[i] for i in result], [points[i] for i in best])
-        np.testing.assert_allclose(scores[row, : len(best)], [points[i] for i in best], rtol=1e-6)
-
-
-def test_equal_sums_keep_the_order_of_the_images() -> None:
-    lists = [np.array([[5, 3, 9]]), np.array([[3, 5, 7]])]
-    assert fuse_rankings(lists, 4)[0].tolist() == [[3, 5, 7, 9]]
+def test_reciprocal_ranks_add_up_and_equal_sums_keep_the_order_of_the_images() -> None:
+    # -1 ends a list that is shorter
+    lists = [np.array([[5, 3, 9, -1], [-1] * 4]), np.array([[3, 5, 7], [0, -1, -1]])]
+    images, sums = fuse_rankings(lists, 3, [1.0, 3.0])
+    assert images.tolist() == [[3, 5, 7], [0, -1, -1]]
+    by_hand = [0.25 / 62 + 0.75 / 61, 0.25 / 61 + 0.75 / 62, 0.75 / 63]
+    np.testing.assert_allclose(sums, [by_hand, [0.75 / 61, -np.inf, -np.inf]], rtol=1e-6)
+    equal = [np.array([[5, 3, 9]]), np.array([[3, 5, 7]])]
+    assert fuse_rankings(equal, 5)[0].tolist() == [[3, 5, 7, 9, -1]]
 
 
 def ids(*values: int) -> np.ndarray:
@@ -126,22 +87,9 @@ def ids(*values: int) -> np.ndarray:
 
 
 def test_coverage_prefers_images_that_add_more_points() -> None:
-    images = [ids(0, 1, 2, 3), ids(0, 1, 2), ids(7, 8), ids()]
+    images = [ids(0, 1, 2, 3), ids(0, 1), ids(7, 8), ids(1, 2, 3)]
     assert greedy_coverage(images, 2) == ([0, 2], [4, 2])
     # images that add nothing follow in order of their matches, then of their index
-    assert greedy_coverage(images, 9) == ([0, 2, 1, 3], [4, 2, 0, 0])
+    assert greedy_coverage(images, 9) == ([0, 2, 3, 1], [4, 2, 0, 0])
     assert greedy_coverage([ids(), ids()], 9) == ([0, 1], [0, 0])
     assert greedy_coverage([], 3) == ([], [])
-
-
-@given(st.lists(st.sets(st.integers(0, 12)), max_size=6), st.integers(1, 4))
-def test_greedy_coverage_is_near_the_best(sets: list[set[int]], keep: int) -> None:
-    order, added = greedy_coverage([ids(*sorted(points)) for points in sets], keep)
-    assert len(order) == len(set(order)) == min(keep, len(sets))
-    covered = set().union(*(sets[at] for at in order))
-    assert sum(added) == len(covered)
-    best = max(
-        (len(set().union(*some)) for some in combinations(sets, min(keep, len(sets)))), default=0
-    )
-    assert len(covered) >= (1 - 1 / np.e) * best
-    assert sorted(added, reverse=True) == added

@@ -62,40 +62,6 @@ def test_empty_queries_and_databases_give_empty_rankings(queries: int, rows: int
     assert indices.shape == scores.shape == (queries, rows)
 
 
-class Blocks:
-    """A source that reads rows on demand and records the reads."""
-
-    def __init__(self, rows: NDArray[np.float64]) -> None:
-        self.rows, self.reads = rows, list[tuple[int, int]]()
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @property
-    def dimension(self) -> int:
-        return int(self.rows.shape[1])
-
-    def read(
-        self, start: int, stop: int, out: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        self.reads.append((start, stop))
-        rows = np.empty((stop - start, self.dimension), np.float32) if out is None else out
-        rows[:] = self.rows[start:stop]
-        return rows
-
-
-def test_a_source_is_read_once_in_blocks() -> None:
-    rng = np.random.default_rng(2)
-    queries, database = rng.integers(-3, 4, (9, 4)) * 1.0, rng.integers(-3, 4, (50, 4)) * 1.0
-    source = Blocks(database)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "_MOST_ROWS", 16)
-        result = rank_by_similarity(queries, source, 7)
-    assert source.reads == [(0, 16), (16, 32), (32, 48), (48, 50)]
-    for ours, expected in zip(result, full_sort(queries, database, 7), strict=True):
-        np.testing.assert_array_equal(ours, expected)
-
-
 @pytest.mark.parametrize("method", ["ghm", "mean", "early", "reciprocal_rank"])
 def test_fused_ranking_equals_whole_matrices(method: str) -> None:
     rng = np.random.default_rng(4)

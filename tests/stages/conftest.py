@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tarfile
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,15 +20,13 @@ from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
     ImagePair,
-    KaptureData,
     KaptureFolder,
-    Sensor,
     write_sensors,
 )
-from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind, feature_folder
+from megloc_kapture.io.kapture.features import ArrayKind
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.global_features import extract_vlad
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
@@ -45,6 +41,7 @@ from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.work import HERE
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from tests.worlds import one_camera
 
 EXTRACTOR = RootSift(RootSiftOptions(max_keypoints=800))
 VLAD = VladOptions(num_clusters=8)
@@ -139,39 +136,16 @@ def world(images_only: World) -> World:
 def write_features() -> Callable[..., None]:
     """Function that writes arrays by image as features of a type."""
 
-    def write(
-        root: Path,
-        kind: ArrayKind,
-        name: str,
-        arrays: Mapping[str, NDArray[Any]],
-        *,
-        orphan: bool = True,
-        tar: bool = False,
-    ) -> None:
+    def write(root: Path, kind: ArrayKind, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         like = next(iter(arrays.values()))
         keypoints_type = name if kind == "descriptors" else None
         metric = None if kind == "keypoints" else "L2"
         config = FeatureConfig(name, like.dtype, like.shape[-1], keypoints_type, metric)
-        with FeatureWriter(root, kind, name, config, orphan=orphan) as writer:
+        with FeatureWriter(root, kind, name, config, orphan=True) as writer:
             for image, array in arrays.items():
                 writer.write(image, array)
-        if tar:
-            folder = feature_folder(root, kind, name, orphan=orphan)
-            with tarfile.open(folder / f"{kind}.tar", "w") as file:
-                for image in arrays:
-                    path = folder / (image + SUFFIX[kind])
-                    file.add(path, path.relative_to(folder))
-                    path.unlink()
 
     return write
-
-
-@pytest.fixture(scope="session")
-def two_processes() -> Iterator[Executor]:
-    """An executor with two worker processes."""
-    with open_executor("processes", 2) as executor:
-        assert executor is not None
-        yield executor
 
 
 @pytest.fixture(scope="session")
@@ -190,7 +164,7 @@ def distance_to_walls() -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
 
 @pytest.fixture
 def small_kapture(tmp_path: Path) -> Callable[..., KaptureFolder]:
-    """Function that writes images (arrays by name) as a kapture folder."""
+    """Function that writes images of one size (arrays by name) as a kapture folder."""
 
     def make(
         images: dict[str, NDArray[np.uint8]],
@@ -199,21 +173,12 @@ def small_kapture(tmp_path: Path) -> Callable[..., KaptureFolder]:
         poses: dict[str, RigidTransform] | None = None,
         camera: Camera | None = None,
     ) -> KaptureFolder:
+        height, width = next(iter(images.values())).shape[:2]
+        shared = camera or Camera("SIMPLE_PINHOLE", width, height, (300.0, width / 2, height / 2))
         root = tmp_path / name
-        data = KaptureData()
-        for timestamp, (image, pixels) in enumerate(images.items()):
-            height, width = pixels.shape[:2]
-            image_camera = camera or Camera(
-                "SIMPLE_PINHOLE", width, height, (300.0, width / 2, height / 2)
-            )
-            data.sensors[f"cam{timestamp}"] = Sensor.from_camera(image_camera)
-            data.records_camera[timestamp, f"cam{timestamp}"] = image
-            if poses and image in poses:
-                data.trajectories[timestamp, f"cam{timestamp}"] = poses[image]
-            path = root / "sensors" / "records_data" / image
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_image(path, pixels)
-        write_sensors(root, data)
+        write_sensors(root, one_camera(list(images), poses, camera=shared))
+        for image, pixels in images.items():
+            write_image(root / "sensors" / "records_data" / image, pixels)
         return KaptureFolder(root, features_dirs=[tmp_path / "features"])
 
     return make

@@ -164,7 +164,7 @@ def test_images_with_depth_keep_it_and_missing_files_have_a_reason(
     data.rigs = {"rig": dict.fromkeys((camera, "depth"), RigidTransform.identity())}
     data.records_depth = {(timestamp, "depth"): "measured.depth"}
     write_sensors(root, data)
-    options = OPTIONS.model_copy(update={"mode": "depth"})
+    options = OPTIONS.model_copy(update={"mode": "depth", "max_size_px": 100})
 
     counts = densify_map(KaptureFolder(root), tmp_path / "out", options)
 

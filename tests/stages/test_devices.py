@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import MeglocError, OptionError, PluginError
-from megloc_kapture.features.aslfeat import AslFeatNet
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.features.superpoint import SuperPointNet
 from megloc_kapture.io.images import read_image_rgb
@@ -62,25 +61,20 @@ def frames(shared_data: Path) -> list[tuple[Image, NDArray[np.bool_] | None]]:
 
 @pytest.fixture(scope="module")
 def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random checkpoints of networks whose published weights are not free."""
-    folder = tmp_path_factory.mktemp("random")
+    """A random checkpoint of SuperPoint, whose published weights are not free."""
+    path = tmp_path_factory.mktemp("random") / "superpoint.pth"
     torch.manual_seed(1)
-    torch.save(SuperPointNet().state_dict(), folder / "superpoint.pth")
-    state = AslFeatNet().state_dict()
-    for key, value in state.items():
-        noise = 0.1 * torch.randn_like(value)
-        state[key] = value + (noise.abs() + 0.5 if "var" in key or "max" in key else noise)
-    torch.save(state, folder / "aslfeat.pth")
-    return folder
+    torch.save(SuperPointNet().state_dict(), path)
+    return path
 
 
-@pytest.mark.parametrize("name", ["aliked", "xfeat", "r2d2", "superpoint", "aslfeat"])
+@pytest.mark.parametrize("name", ["aliked", "xfeat", "r2d2", "superpoint"])
 def test_features_of_a_batch(
     shared_data: Path, random_weights: Path, frames: Any, name: str
 ) -> None:
     of = {"aliked": "aliked/aliked-n16.pth", "xfeat": "xfeat/xfeat.pt"}
     of["r2d2"] = "r2d2/r2d2_WASF_N16.pt"
-    path = shared_data / "weights" / of[name] if name in of else random_weights / f"{name}.pth"
+    path = shared_data / "weights" / of[name] if name in of else random_weights
     options = {"min_size": 80, "max_size": 100} if name == "r2d2" else {}
     given = {"weights": str(path), "device": "cpu", **options}
     extractor = load_plugin(LOCAL_FEATURES, name, given)
@@ -204,7 +198,6 @@ class ManySift(RootSift):
 def test_one_thread_uses_the_gpu(
     world: Any,
     tmp_path: Path,
-    two_processes: Executor,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folders = [world.mapping(), world.query()]
@@ -225,7 +218,8 @@ def test_one_thread_uses_the_gpu(
     monkeypatch.setattr(
         devices, "on_gpu", lambda plugin: isinstance(plugin, RootSift | NearestNeighbours)
     )
-    there = run(tmp_path / "there", Work(two_processes))
+    with ThreadPoolExecutor(2) as executor:
+        there = run(tmp_path / "there", Work(executor))
     assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
     assert there.seen == [3, 3]  # and the seventh image alone
     assert len(there.threads) == 1 and threading.get_ident() not in there.threads
@@ -264,16 +258,14 @@ def test_settings_depend_on_precision_not_on_the_device(
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_a_device_without_a_gpu_is_refused() -> None:
     assert pick_device("auto") == pick_device("cpu") == torch.device("cpu")
-    for device in ("cuda", "cuda:0", "cuda:3"):
-        with pytest.raises(OptionError, match=f"device={device}: this machine has no GPU"):
-            pick_device(device)
+    with pytest.raises(OptionError, match="device=cuda:0: this machine has no GPU"):
+        pick_device("cuda:0")
 
 
 @pytest.mark.parametrize(
     ("message", "expected"),
     [
         ("CUDA error: out of memory", True),
-        ("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`", True),
         ("cuDNN error: CUDNN_STATUS_ALLOC_FAILED", True),
         ("[enforce fail at alloc_cpu.cpp] can't allocate memory: you tried to allocate", True),
         ("CUDA error: device-side assert triggered", False),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import kapture.io.csv
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -34,21 +33,6 @@ def test_extracted_features_are_stored(world: Any) -> None:
         np.testing.assert_array_equal(keypoints.read(image), expected.keypoints_px)
         np.testing.assert_array_equal(descriptors.read(image), expected.descriptors)
         assert len(expected.scores) > 300
-
-
-def test_kapture_reads_the_features(world: Any, tmp_path: Path) -> None:
-    # kapture's tools link the features into the kapture folder
-    (tmp_path / "sensors").symlink_to(world.root / "mapping" / "sensors")
-    for kind in ("keypoints", "descriptors"):
-        place = tmp_path / "reconstruction" / kind / "rootsift"
-        place.parent.mkdir(parents=True)
-        place.symlink_to(world.features_dir / "local_features" / "rootsift" / kind)
-    theirs = kapture.io.csv.kapture_from_dir(str(tmp_path))
-    keypoints = theirs.keypoints["rootsift"]
-    assert set(keypoints) == set(world.map_poses)
-    assert (keypoints.type_name, keypoints.dtype, keypoints.dsize) == ("rootsift", np.float32, 2)
-    found = theirs.descriptors["rootsift"]
-    assert (found.dsize, found.keypoints_type, found.metric_type) == (128, "rootsift", "L2")
 
 
 def test_masks_with_a_margin_remove_keypoints(small_kapture: Any, tmp_path: Path) -> None:
@@ -94,38 +78,26 @@ def test_damaged_inputs_are_refused(small_kapture: Any, tmp_path: Path) -> None:
     refused(r"a.png: the image is 160x120, its camera says 320x240", larger)
 
 
-def features(count: int = 3, **changes: Any) -> LocalFeatures:
-    values = {
-        "keypoints_px": np.ones((count, 2), np.float32),
-        "scores": np.ones(count, np.float32),
-        "descriptors": np.ones((count, 4), np.float32),
-    }
-    return LocalFeatures(**{**values, **changes})
-
-
-class Returning:
-    """An extractor that returns a fixed value."""
-
-    name = "returning"
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
-
-    def extract(self, image: Image, mask: NDArray[np.bool_] | None = None) -> Any:
-        return self.value
-
-
-def test_wrong_features_of_a_plugin_are_refused(small_kapture: Any, tmp_path: Path) -> None:
-    folder = small_kapture({"a.png": noise()})
-    wrong = Returning(features(descriptors=np.ones((2, 4), np.float32)))
-    message = r"plugin 'returning' on image a\.png: .*got float32 \(2, 4\), expected .*3, N"
-    with pytest.raises(PluginError, match=message):
-        extract_local_features([folder], wrong, tmp_path / "features")
-
-
 def test_images_without_features_are_stored(small_kapture: Any, tmp_path: Path) -> None:
     folder = small_kapture({"a.png": noise(), "gray.png": np.full((120, 160, 3), 90, np.uint8)})
     extract_local_features([folder], EXTRACTOR, tmp_path / "features")
     assert folder.keypoints("rootsift").read("gray.png").shape == (0, 2)
     assert folder.descriptors("rootsift").read("gray.png").shape == (0, 128)
     assert folder.keypoints("rootsift").length("a.png") > 0
+
+
+class Inconsistent:
+    """An extractor that returns fewer descriptors than keypoints."""
+
+    name = "inconsistent"
+
+    def extract(self, image: Image, mask: NDArray[np.bool_] | None = None) -> LocalFeatures:
+        keypoints_px, descriptors = np.ones((3, 2), np.float32), np.ones((2, 4), np.float32)
+        return LocalFeatures(keypoints_px, np.ones(3, np.float32), descriptors)
+
+
+def test_wrong_features_of_a_plugin_are_refused(small_kapture: Any, tmp_path: Path) -> None:
+    folder = small_kapture({"a.png": noise()})
+    message = r"'inconsistent' on image a\.png: .*got float32 \(2, 4\), expected .*3, N"
+    with pytest.raises(PluginError, match=message):
+        extract_local_features([folder], Inconsistent(), tmp_path / "features")

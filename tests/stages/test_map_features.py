@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,6 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features.rootsift import (
-    RootSift,
-    RootSiftOptions,
-)
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
@@ -25,7 +22,6 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.stages.global_features import extract_vlad, read_vocabulary
-from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_features import (
     copy_features,
     move_points,
@@ -36,7 +32,7 @@ from megloc_kapture.stages.map_features import (
 TYPE = "rootsift"
 
 
-def published(source: KaptureFolder, root: Path, *, shift_px: float = 0.0) -> KaptureFolder:
+def published(source: KaptureFolder, root: Path) -> KaptureFolder:
     """Write a map without descriptors: only observed keypoints, in another order."""
     seen = source.observations()[TYPE]
     write_sensors(root, source.read())
@@ -51,8 +47,7 @@ def published(source: KaptureFolder, root: Path, *, shift_px: float = 0.0) -> Ka
             used = rng.permutation(np.unique(seen.keypoint_ids[here]))
             for number, keypoint in enumerate(used.tolist()):
                 numbers[here[seen.keypoint_ids[here] == keypoint]] = number
-            places = source.keypoints(TYPE).read(image)[used, :2]
-            writer.write(image, places + np.float32(shift_px))
+            writer.write(image, source.keypoints(TYPE).read(image)[used, :2])
     again = Observations(TYPE, seen.image_names, seen.point_ids, seen.image_ids, numbers)
     write_observations(root, {TYPE: again})
     return KaptureFolder(root)
@@ -97,15 +92,28 @@ def test_observations_move_to_extracted_features(world: Any, tmp_path: Path) -> 
         assert set(map(tuple, stored)) < set(map(tuple, extracted))
 
 
-def with_fewer_features(world: Any, root: Path, max_keypoints: int) -> KaptureFolder:
-    extractor = RootSift(RootSiftOptions(max_keypoints=max_keypoints))
-    extract_local_features([world.mapping()], extractor, root)
-    return world.mapping().with_features([root])
+@pytest.fixture
+def with_fewer_features(
+    world: Any, write_features: Any, tmp_path: Path
+) -> Callable[[int], KaptureFolder]:
+    """Function: the mapping folder with the first features of each image only."""
+
+    def make(number: int) -> KaptureFolder:
+        for kind in ("keypoints", "descriptors"):
+            reader = getattr(world.mapping(), kind)(TYPE)
+            first = {image: reader.read(image)[:number] for image in reader.names}
+            write_features(tmp_path / "features", kind, TYPE, first)
+        folder: KaptureFolder = world.mapping().with_features([tmp_path / "features"])
+        return folder
+
+    return make
 
 
-def test_observations_without_a_feature_are_left_out(world: Any, tmp_path: Path) -> None:
+def test_observations_without_a_feature_are_left_out(
+    world: Any, with_fewer_features: Any, tmp_path: Path
+) -> None:
     truth, reference = world.map(), published(world.map(), tmp_path / "reference")
-    some = with_fewer_features(world, tmp_path / "features", 450)
+    some = with_fewer_features(600)
     counts = move_points(reference, some, TYPE, tmp_path / "map")
     made = KaptureFolder(tmp_path / "map")
     made.validate()
@@ -121,9 +129,11 @@ def test_observations_without_a_feature_are_left_out(world: Any, tmp_path: Path)
     assert set(made.observations()[TYPE].point_ids.tolist()) == set(range(len(points)))
 
 
-def test_a_map_of_other_features_is_refused(world: Any, tmp_path: Path) -> None:
+def test_a_map_of_other_features_is_refused(
+    world: Any, with_fewer_features: Any, tmp_path: Path
+) -> None:
     reference = published(world.map(), tmp_path / "reference")
-    some = with_fewer_features(world, tmp_path / "features", 100)
+    some = with_fewer_features(100)
     with pytest.raises(DataError, match=r"extracting rootsift again finds keypoints of only \d+%"):
         move_points(reference, some, TYPE, tmp_path / "map")
     assert not (tmp_path / "map").exists()

@@ -51,7 +51,7 @@ def pose(image: int) -> RigidTransform:
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (-0.3 * image, 0.0, 0.0))
 
 
-def write_wall(root: Path, *, shift_px: float = 0.0, unposed: Sequence[int] = ()) -> KaptureFolder:
+def write_wall(root: Path, *, unposed: Sequence[int] = ()) -> KaptureFolder:
     """Write six images in a row in front of a wall; each sees all points but the lifted ones.
 
     Points 60 to 65 float in front of a hole of the depth maps.
@@ -82,7 +82,7 @@ def write_wall(root: Path, *, shift_px: float = 0.0, unposed: Sequence[int] = ()
         if image != WITHOUT_DEPTH:
             data.records_depth[image, "depth"] = f"wall/{image}.depth"
             write_depth_map(root / "sensors" / "records_data" / f"wall/{image}.depth", depth)
-        keypoints[name] = (project(CAMERA, pose(image), xyz) + shift_px).astype(np.float32)
+        keypoints[name] = project(CAMERA, pose(image), xyz).astype(np.float32)
     write_sensors(root, data)
     # by type, pairs of a point and an image; the keypoint has the number of the point
     of_type: dict[str, list[tuple[int, int]]] = {"a": [], "b": []}
@@ -158,14 +158,6 @@ def test_points_in_front_of_the_wall_are_removed(wall: KaptureFolder, tmp_path: 
     assert removed.observations == sum(map(len, before.values())) - sum(map(len, after.values()))
     assert report.observations_before - removed.observations == report.observations_after
     folder.validate()
-
-
-def test_missing_depth_maps_remove_no_points(tmp_path: Path) -> None:
-    without = write_wall(tmp_path / "map")
-    for path in (without.root / "sensors" / "records_data").rglob("*.depth"):
-        path.unlink()
-    folder, report = refined(without, tmp_path / "without")
-    assert report.filters == () and contents(folder) == contents(without)
 
 
 def test_without_filters_the_map_is_copied_or_linked(wall: KaptureFolder, tmp_path: Path) -> None:

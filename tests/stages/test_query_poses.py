@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,7 +12,6 @@ import pandas
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.errors import PluginError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.images import read_image_rgb
@@ -29,8 +27,9 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import ClusterOptions
 from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatches
+from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseHypothesis, RankingScene
+from megloc_kapture.plugins import POSE_RANKERS, PoseHypothesis, RankingScene
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
     localize_query,
@@ -42,7 +41,7 @@ from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 
-def test_queries_are_localized_accurately(world: Any, two_processes: Executor) -> None:
+def test_queries_are_localized_accurately(world: Any) -> None:
     results = world.localized()
     assert [result.name for result in results] == sorted(world.query_poses)
     for result in results:
@@ -57,7 +56,8 @@ def test_queries_are_localized_accurately(world: Any, two_processes: Executor) -
         error = np.concatenate([vector, delta.translation])
         # six degrees of freedom, with room for errors of the map
         assert error @ np.linalg.solve(result.covariance, error) < 100
-    in_processes = world.localized(work=Work(two_processes))
+    with open_executor("processes", 2) as executor:
+        in_processes = world.localized(work=Work(executor))
     for a, b in zip(results, in_processes, strict=True):
         assert (a.cam_from_world, a.num_inliers) == (b.cam_from_world, b.num_inliers)
 
@@ -93,11 +93,6 @@ def test_a_ranker_sees_poses_and_images(world: Any, monkeypatch: pytest.MonkeyPa
     for result in world.localized():
         pixels = read_image_rgb(world.query().image_path(result.name))
         assert result.clusters[0].score == pytest.approx(pixels.mean())
-
-
-def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None:
-    with pytest.raises(PluginError, match="no plugin 'no-such' in megloc_kapture.pose_rankers"):
-        world.localized(rank=PluginChoice(name="no-such"))
 
 
 class Candidates:
@@ -219,11 +214,6 @@ def test_localized_queries_are_written_as_kapture_and_tables(world: Any, tmp_pat
     assert {line.split(",")[1] for line in lines[1:]} >= {"reading", "estimation", "refinement"}
 
 
-def half_failed(world: Any) -> list[Pose | Failure]:
-    first, second = world.localized()
-    return [Failure("no map image matches", name=first.name), second]
-
-
 @pytest.mark.parametrize(
     ("fallback", "retrieved", "has_fallback"),
     [("none", True, False), ("retrieval", False, False), ("retrieval", True, True)],
@@ -232,8 +222,10 @@ def test_a_failed_query_has_no_pose_without_a_fallback(
     world: Any, tmp_path: Path, fallback: Any, retrieved: bool, has_fallback: bool
 ) -> None:
     fallback_pose = world.map_poses["left/1.png"]
+    first, second = world.localized()
+    results = [Failure("no map image matches", name=first.name), second]
     counts = write_localized(
-        tmp_path, world.query(), half_failed(world), fallback=fallback,
+        tmp_path, world.query(), results, fallback=fallback,
         first_candidates={q: ("left/1.png", fallback_pose) for q in world.query_poses if retrieved},
     )  # fmt: skip
     assert counts == {"queries": 2, "localized": 1, "failed": 1, "fallbacks": int(has_fallback)}

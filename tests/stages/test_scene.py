@@ -29,7 +29,6 @@ from megloc_kapture.stages.scene import (
     query_units,
     shared_index,
     with_noise,
-    write_index,
 )
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
@@ -112,67 +111,46 @@ NAMES = ("a/é.jpg", "b\n.jpg", "c.jpg")
 ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids")
 
 
-def make_index(*, covariances: bool = False) -> MapIndex:
+def test_a_shared_index_is_opened_without_reading_it_and_its_files_are_removed() -> None:
     rng = np.random.default_rng(0)
     images, keypoints, points = (rng.integers(0, n, 200) for n in (3, 50, 40))
-    known = rng.normal(size=(40, 6)) if covariances else None
-    xyz = rng.normal(size=(40, 3)) + 4e6
-    return MapIndex.build(xyz, NAMES, images, keypoints, points, known)
-
-
-def empty_index() -> MapIndex:
+    xyz, covariances = rng.normal(size=(40, 3)) + 4e6, rng.normal(size=(40, 6))
     none = np.zeros(0, dtype=np.int64)
-    return MapIndex.build(np.zeros((0, 3)), (), none, none, none)
-
-
-@pytest.mark.parametrize(
-    "index", [make_index(), make_index(covariances=True), empty_index()], ids=str
-)
-def test_a_written_index_is_opened_without_reading_it(index: MapIndex, tmp_path: Path) -> None:
-    write_index(index, tmp_path / "index")
-    opened = open_index(tmp_path / "index")
-    assert opened.row_of_image == index.row_of_image
-    for name in ARRAYS:
-        mine, theirs = getattr(opened, name), getattr(index, name)
-        assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape)
-        np.testing.assert_array_equal(mine, theirs)
-        assert not mine.flags.writeable
-        assert len(mine) == 0 or isinstance(mine.base, np.memmap)
-    assert (opened.covariances is None) == (index.covariances is None)
-    if index.covariances is not None:
-        np.testing.assert_array_equal(opened.covariances, index.covariances)
-
-
-def test_files_of_a_shared_index_are_removed() -> None:
-    index = make_index()
-    with shared_index({"sift": index, "other": empty_index()}) as folders:
-        assert list(folders) == ["sift", "other"]
-        opened = open_index(folders["sift"])
+    indices = {
+        "sift": MapIndex.build(xyz, NAMES, images, keypoints, points, covariances),
+        "empty": MapIndex.build(np.zeros((0, 3)), (), none, none, none),
+    }
+    with shared_index(indices) as folders:
+        opened = {name: open_index(folder) for name, folder in folders.items()}
     assert not any(folder.parent.exists() for folder in folders.values())
     # an open index stays valid
-    found = opened.shared_points(NAMES).tolist()
-    assert found == index.shared_points(NAMES).tolist()
+    assert opened.keys() == indices.keys() and opened["empty"].covariances is None
+    np.testing.assert_array_equal(opened["sift"].covariances, covariances)
+    for name, index in indices.items():
+        assert opened[name].row_of_image == index.row_of_image
+        for array in ARRAYS:
+            mine, theirs = getattr(opened[name], array), getattr(index, array)
+            assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape)
+            np.testing.assert_array_equal(mine, theirs)
+            assert not mine.flags.writeable
+            assert len(mine) == 0 or isinstance(mine.base, np.memmap)
 
 
-def test_a_map_without_points_has_an_empty_index(world: Any, tmp_path: Path) -> None:
-    whole = world.map()
-    root = Path(shutil.copytree(whole.root, tmp_path / "map", symlinks=True))
-    write_points3d(root, np.zeros((0, 6)))
-    write_observations(root, {})
-    empty = KaptureFolder(root, features_dirs=whole.features_dirs)
-    index = index_map(empty, "rootsift")
-    assert index.xyz.shape == (0, 3) and not index.row_of_image
+def test_an_index_has_the_covariances_of_the_map_and_may_be_empty(
+    world: Any, tmp_path: Path
+) -> None:
     with pytest.raises(DataError, match="no observations of type 'other'"):
         index_map(world.map(), "other")
-
-
-def test_covariances_of_the_map_are_read(world: Any, tmp_path: Path) -> None:
-    folder = KaptureFolder(shutil.copytree(world.map().root, tmp_path / "map"))
+    root = Path(shutil.copytree(world.map().root, tmp_path / "map", symlinks=True))
+    folder = KaptureFolder(root)
     count = len(folder.points3d())
     known = np.arange(6.0 * count).reshape(count, 6)
-    write_point_covariances(folder.root, known)
-    index = index_map(folder, "rootsift")
-    np.testing.assert_array_equal(index.covariances, known)
+    write_point_covariances(root, known)
+    np.testing.assert_array_equal(index_map(folder, "rootsift").covariances, known)
+    write_points3d(root, np.zeros((0, 6)))
+    write_observations(root, {})
+    index = index_map(KaptureFolder(root), "rootsift")
+    assert index.xyz.shape == (0, 3) and not index.row_of_image
 
 
 def test_noise_is_measured_by_points_with_several_observations(world: Any) -> None:
