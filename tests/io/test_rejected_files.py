@@ -60,7 +60,6 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ("name", "row", "message"),
     [
         ("sensors/records_camera.txt", "1, cam", "expected 3 columns, got 2"),
-        ("sensors/records_camera.txt", "1.5, cam, a.jpg", "invalid literal for int.* '1.5'"),
         ("sensors/records_camera.txt", "9, nocam, a.jpg", "unknown sensor or rig 'nocam'"),
         ("sensors/records_camera.txt", "9, deep, a.jpg", "of type 'depth', not 'camera'"),
         ("sensors/records_camera.txt", "0, cam, b.jpg", "timestamp 0 of 'cam' is listed twice"),
@@ -70,7 +69,6 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         ("sensors/trajectories.txt", "1, cam, nan, 0, 0, 0, 0, 0, 0", "finite numbers qw"),
         ("sensors/trajectories.txt", "1, cam, 0.998, 0, 0, 0, 0, 0, 0", "not a unit quaternion"),
         ("sensors/trajectories.txt", "1, cam, 1, 0, 0, , 0, 0, 0", "some but not all"),
-        ("sensors/trajectories.txt", f"0, rig, {IDENTITY}", "unknown sensor or rig 'rig'"),
         ("sensors/sensors.txt", "x, ", "at least 3 columns"),
         ("sensors/sensors.txt", "cam, n, gnss", "'cam' is empty or listed twice"),
         ("sensors/sensors.txt", "x, n, camera", "expected a camera model, width, height"),
@@ -80,16 +78,13 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         ("sensors/sensors.txt", "x, n, camera, UNKNOWN_CAMERA, 640", "width and a height"),
         ("sensors/rigs.txt", f"deep, cam, {IDENTITY}", "also a sensor id"),
         ("sensors/rigs.txt", f"rig, cam, {IDENTITY}", "twice"),
-        ("keypoints.txt", "n, float32", "expected 3 columns, got 2"),
         ("keypoints.txt", "n, float16, 2", "dtype 'float16' is not one of"),
         ("keypoints.txt", "n, float32, 0", "dsize '0'"),
         ("descriptors.txt", "n, float32, 2, ../k, L2", "leads out"),
-        ("pairs.txt", "a, b", "expected 3 columns, got 2"),
         ("pairs.txt", "a, b, c", "expected finite numbers score, got 'c'"),
         ("pairs.txt", "a, ../b, 1", "leads out"),
         ("pairs.txt", ", b, 1", "empty"),
         ("table.csv", "c", "1 fields"),
-        ("table.csv", "a,b,c", "3 fields"),
         ("groups.csv", "a.jpg,day,,,x", "scored: it should be a valid boolean"),
         ("groups.csv", "../a.jpg,day,,,1", "leads out"),
         ("names.csv", "a.jpg,x y", "name: "),
@@ -112,7 +107,6 @@ def test_a_wrong_row_is_named_with_file_and_line(
 @pytest.mark.parametrize(
     ("head", "message"),
     [
-        ("# kapture format: 1.2\n", "1.2 is not supported"),
         ("# kapture format: 11.1\n", "11.1 is not supported"),
         ("", "first line must be"),
     ],
@@ -164,11 +158,9 @@ def test_wrong_points_are_named(tmp_path: Path, row: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("5, t, a", "expected point3d_id"),
         ("5, t, a, 1, b", "expected point3d_id"),
         ("x, t, a, 1", "expected point3d_id"),
         ("5, t, a, -1", "ids from 0 on"),
-        (f"5, t, a, {2**31}", "ids from 0 on"),
         ("5, t/u, a, 1", "cannot be a type name"),
         ("5, t, ../a, 1", "leads out"),
     ],
@@ -216,7 +208,7 @@ def test_a_depth_map_of_another_size_or_a_missing_one_is_named(tmp_path: Path) -
         read_depth_map(tmp_path / "b.depth", width=3, height=2)
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 def test_truncated_images_are_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / ("a" + suffix)
     pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
