@@ -101,6 +101,7 @@ def test_empty_and_binary_files_are_named(tmp_path: Path, reader: Reader) -> Non
     [
         (read_transform, "0 0 1 -1e-1", "0 0 1", None, "expected the 16 elements"),
         (read_transform, "-1e-1", "nan", None, "not a rotation and a translation"),
+        (read_transform, "1 0 0 2.0", "2 0 0 2.0", None, "not a rotation"),
         (fourseasons.read_poses, "0 0.6", "", 1, "expected finite numbers tx ty tz"),
         (fourseasons.read_poses, "0.6 0 0.8", "0 0 0", 1, "not a unit quaternion"),
         (robotcar.read_intrinsics, "cy 4", "cz 4", None, "cy missing"),

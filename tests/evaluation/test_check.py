@@ -186,6 +186,7 @@ def named(
             "100.jpg should be rear/100.jpg; the server finds none of them, and every figure is",
         ),
         (lambda name: AACHEN[name], AACHEN, "query/day/IMG_0.jpg should be IMG_0.jpg"),
+        (lambda name: f"./{name}", AACHEN, "./IMG_0.jpg should be IMG_0.jpg"),
         (lambda name: name.replace(".jpg", ".JPG"), AACHEN, "IMG_0.JPG should be IMG_0.jpg"),
     ],
 )
