@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -118,18 +116,5 @@ def contents() -> Callable[[Path], dict[str, bytes]]:
             elif path.is_file():
                 files[str(path.relative_to(root))] = path.read_bytes()
         return files
-
-    return read
-
-
-@pytest.fixture(scope="session")
-def data_of() -> Callable[[Path], dict[str, Any]]:
-    """Function: the data of a page of ``megloc view``."""
-
-    def read(page: Path) -> dict[str, Any]:
-        content = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
-        assert content is not None
-        data: dict[str, Any] = json.loads(content[1])
-        return data
 
     return read

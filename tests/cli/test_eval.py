@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -83,31 +82,6 @@ def test_the_workspace_has_the_documented_files(finished: Path, scene: Path) -> 
     assert [p for p in finished.rglob("*.jpg") if not p.is_symlink() and p.is_file()] == []
 
 
-def test_all_queries_of_the_small_scene_are_localized(finished: Path) -> None:
-    rows = json.loads((finished / "evaluation" / "recall.json").read_text())["rows"]
-    (row,) = (row for row in rows if row["name"] == "all")
-    assert [at["recall"] for at in row["recall"]] == [1.0] * 4
-    statuses = read_status(finished / "localized" / "status.csv")
-    assert len(statuses) == 4
-    assert all(s.status == "localized" and s.fallback == "none" for s in statuses.values())
-
-
-def test_the_pose_file_is_copied_to_the_folder_of_submissions(
-    evaluate: Any, scene: Path, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    until = ("--until", "submission", "--submissions", "kept")
-    copy = Path("kept") / Path(POSES).name
-    assert evaluate(scene, workspace, *until).out == f"pose file  {copy}\n"
-    first = copy.read_bytes()
-    assert first == (workspace / POSES).read_bytes()
-    assert Path(f"{copy}.json").read_bytes() == (workspace / f"{POSES}.json").read_bytes()
-    done = evaluate(scene, workspace, *until, "--set", "localization.pose.max_error_px=6")
-    assert f"{copy} belongs to another result and is kept" in done.err
-    assert f"pose file  {str(copy).replace('.txt', '-2.txt')}\n" in done.out
-    assert copy.read_bytes() == first
-
-
 # ------------------------------------------------------------------ repeated runs
 
 
@@ -124,21 +98,30 @@ def test_the_second_run_does_nothing_and_prints_the_result(
     assert {path: path.stat().st_mtime_ns for path in times} == times
 
 
-def test_a_changed_option_repeats_the_stages_that_depend_on_it(
-    evaluate: Any, scene: Path, workspace: Path
+def test_a_changed_option_repeats_later_stages_and_keeps_the_earlier_pose_file(
+    evaluate: Any, scene: Path, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    until = ("--until", "submission")
+    monkeypatch.chdir(tmp_path)
+    until = ("--until", "submission", "--submissions", "kept")
+    copy = Path("kept") / Path(POSES).name
+    assert evaluate(scene, workspace, *until).out == f"pose file  {copy}\n"
+    first = copy.read_bytes()
+    assert first == (workspace / POSES).read_bytes()
+    assert Path(f"{copy}.json").read_bytes() == (workspace / f"{POSES}.json").read_bytes()
     done = evaluate(scene, workspace, *until, "--set", "localization.pose.max_error_px=6")
     assert ran(done.err) == ["localization", "submission"]
     assert reasons(done.err)["localization"] == "options changed: localization.pose.max_error_px"
     assert reasons(done.err)["submission"] == "localization changed"
+    assert f"{copy} belongs to another result and is kept" in done.err
+    assert f"pose file  {str(copy).replace('.txt', '-2.txt')}\n" in done.out
+    assert copy.read_bytes() == first
 
 
 def test_changed_thresholds_repeat_neither_the_map_nor_the_localization(
     evaluate: Any, scene: Path, workspace: Path
 ) -> None:
-    done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5")
-    assert ran(done.err) == ["import", "submission", "evaluation"]
+    done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5", "--until", "submission")
+    assert ran(done.err) == ["import", "submission"]
     assert reasons(done.err)["import"] == "options changed: protocol.thresholds"
 
 

@@ -35,15 +35,12 @@ def write_kapture(root: Path, images: list[str], poses: dict[str, RigidTransform
 
 def write_candidates(result: Path) -> None:
     """Write a status with one candidate per query, from the same location."""
-    write_status(
-        result / "status.csv",
-        [
-            LocalizationResult(
-                name=image, num_matches=99, num_inliers=50, candidates=(f"map/{i // 2}.jpg",)
-            )
-            for i, image in enumerate(IMAGES)
-        ],
-    )
+    counts = {"num_matches": 99, "num_inliers": 50}
+    rows = [
+        LocalizationResult(name=image, candidates=(f"map/{i // 2}.jpg",), **counts)
+        for i, image in enumerate(IMAGES)
+    ]
+    write_status(result / "status.csv", rows)
 
 
 def poses_off(by_m: float, num_lost: int = 0) -> dict[str, RigidTransform]:
@@ -54,11 +51,12 @@ def poses_off(by_m: float, num_lost: int = 0) -> dict[str, RigidTransform]:
     }
 
 
-@pytest.fixture
-def runs(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Workspaces ``a`` and ``b`` of two runs: truth, map, and results with lost queries."""
+    root = tmp_path_factory.mktemp("runs")
     for name, by_m, num_lost in (("a", 0.01, 2), ("b", 0.02, 14)):
-        workspace = tmp_path / name
+        workspace = root / name
         write_kapture(workspace / "query_gt", IMAGES, poses_off(0.0))
         write_kapture(workspace / "mapping", list(MAPPED), MAPPED)
         write_kapture(workspace / "localized", IMAGES, poses_off(by_m, num_lost))
@@ -66,15 +64,15 @@ def runs(tmp_path: Path) -> Path:
         write_protocol(workspace / "megloc", protocol_of("aachen"))
         groups = {image: ImageGroup(condition=image.split("/")[1]) for image in IMAGES}
         write_groups(workspace / "megloc", groups)
-    return tmp_path
+    return root
 
 
 def results(runs: Path, *names: str) -> list[str | Path]:
     return ["evaluate", *(word for name in names for word in ("-i", runs / name / "localized"))]
 
 
-def test_recall_and_report_of_one_result(megloc: Any, runs: Path) -> None:
-    out = runs / "out"
+def test_recall_and_report_of_one_result(megloc: Any, runs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
     done = megloc(*results(runs, "a"), "--gt", runs / "a/query_gt", "-o", out)
     assert done.status == 0
     assert "95.0 / 95.0 / 95.0" in done.out  # all but the two lost ones
@@ -85,8 +83,8 @@ def test_recall_and_report_of_one_result(megloc: Any, runs: Path) -> None:
     assert "From above" in (out / "report.html").read_text()
 
 
-def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path) -> None:
-    out = runs / "out"
+def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
     done = megloc(*results(runs, "a", "b"), "--gt", runs / "a/query_gt", "-o", out)
     assert done.status == 0
     flat = " ".join(done.out.split())
@@ -98,14 +96,16 @@ def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path) -> Non
     assert comparison["tests"][0]["only_first"] == sorted(IMAGES[2:14])
     assert (out / "recall.txt").read_text() == done.out.removesuffix("\n")
     # a pose file may be one of them
-    poses = runs / "poses.txt"
+    poses = tmp_path / "poses.txt"
     write_pose_file(poses, poses_off(0.01, 2), names="basename")
     done = megloc(*results(runs, "a"), "-i", poses, "--gt", runs / "a/query_gt")
-    assert "a/localized and poses.txt find the same 38 queries" in " ".join(done.out.split())
+    assert "/poses.txt find the same 38 queries" in " ".join(done.out.split())
 
 
-def test_results_without_truth_are_compared_with_each_other(megloc: Any, runs: Path) -> None:
-    out = runs / "out"
+def test_results_without_truth_are_compared_with_each_other(
+    megloc: Any, runs: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
     done = megloc(*results(runs, "a", "b"), "-o", out)
     assert done.status == 0
     assert "No recall: The true poses of the queries are not published" in done.out
@@ -125,7 +125,6 @@ def test_results_without_truth_are_compared_with_each_other(megloc: Any, runs: P
         ("", "no result given; use -i"),
         ("-i {}/a/localized -i {}/a/../a/localized", "is given twice"),
         ("-i {}/a/localized --dataset cmu", "unknown dataset 'cmu'; known: aachen"),
-        ("-i {}/a/localized --map {}/nowhere", "nowhere"),
         ("-i {}/a/localized --gt {}/a/query_gt --thresholds x", "METRES,DEGREES"),
         ("-i {}/a/localized --gt {}/a/query_gt -o {}/a", "is not empty"),
     ],

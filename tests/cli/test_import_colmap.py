@@ -26,9 +26,10 @@ def check(result: Path, scene: Path) -> None:
 def test_an_imported_model_is_localized_in(
     megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path
 ) -> None:
-    done = megloc("import", "colmap", colmap_room, "-o", tmp_path / "map")
+    done = megloc("import", "colmap", colmap_room, "-o", tmp_path / "map", "--unit", "m")
     assert done.status == 0 and "observations" in done.out, done
     assert f"database: {colmap_room}/database.db" in done.err
+    assert "unit              metres" in megloc("info", tmp_path / "map").out
     queries = ("--query", scene / "query", "-o", tmp_path / "localized")
     done = megloc("localize", "-i", tmp_path / "map", *queries)
     assert done.out.startswith("4 of 4 queries localized"), done
@@ -43,16 +44,7 @@ def test_a_model_is_imported_to_the_cache_where_a_map_is_expected(
     done = megloc("info", model)
     assert f"{model}: a COLMAP model, as kapture in {tmp_path}/cache/" in done.err
     assert "7 (7 PINHOLE), 7 with a pose" in done.out and "extracted by plugin sift" in done.out
-
-
-@pytest.mark.parametrize(
-    ("unit", "printed"), [((), "units of the map"), (("--unit", "m"), "metres")]
-)
-def test_the_unit_of_a_model_is_unknown_unless_given(
-    megloc: Any, colmap_room: Path, tmp_path: Path, unit: tuple[str, ...], printed: str
-) -> None:
-    assert megloc("import", "colmap", colmap_room, "-o", tmp_path / "map", *unit).status == 0
-    assert f"unit              {printed}" in megloc("info", tmp_path / "map").out
+    assert "unit              units of the map" in done.out
 
 
 def test_a_model_of_poses_alone_without_images_is_imported_as_poses(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -20,14 +19,11 @@ from megloc_kapture.pipeline.presets import BASIC_OPTIONS, PRESETS, options_of, 
 from megloc_kapture.stages.options import PipelineOptions
 
 WRONG_ARGUMENTS = {
-    "no command": ([], "Missing subcommand"),
     "unknown command": (["localise"], "unknown command 'localise'; did you mean 'localize'"),
     "missing flags": (["refine-poses", "-i", "map", "--poses", "p", "-o", "out"], "--query PATH"),
     "unknown flag": (["eval", "kapture", "--roots", "x"], "Perhaps you meant: --root "),
-    "no value": (["eval", "--set"], "Missing value for argument '--set'"),
     "not a number": (["eval", "--workers", "two"], "Error parsing --workers: "),
     "not a choice": (["eval", "-v", "loud"], "invalid choice 'loud'"),
-    "too many": (["info", "a", "b"], "Unrecognized options: b"),
     "value out of range": (["serve", "map", "--max-mb", "0"], "--max-mb 0.0: must be positive"),
 }
 
@@ -47,14 +43,20 @@ def test_every_command_has_a_help_text(megloc: Any, command: str) -> None:
     assert done.out.startswith(f"usage: megloc {command} ")
 
 
-def test_the_list_of_commands_loads_no_heavy_package() -> None:
-    code = (
-        "import sys\nfrom megloc_kapture.cli.main import main\n"
-        "try: main(['--help'])\n"
-        "except SystemExit: print(sorted({'torch', 'scipy', 'numba', 'cv2'} & set(sys.modules)))"
-    )
+def test_help_loads_no_heavy_package_and_no_command_but_serve_the_web_server() -> None:
+    code = """
+import sys
+from megloc_kapture.cli.main import COMMANDS, command_class, main
+try:
+    main(["--help"])
+except SystemExit:
+    print({"torch", "scipy", "numba", "cv2"} & set(sys.modules))
+for name in COMMANDS:
+    command_class(name)
+print({"fastapi", "uvicorn", "starlette"} & set(sys.modules))
+"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.endswith("\n[]\n")
+    assert done.stdout.endswith("\nset()\nset()\n") and done.stderr == ""
     assert all(name in done.stdout for name in COMMANDS)
 
 
@@ -77,23 +79,14 @@ def test_sigterm_ends_with_143_and_says_how_to_continue(
     assert capsys.readouterr().err == message
 
 
-def test_bash_completes_commands_and_their_flags(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_completion_of_bash_has_all_commands_and_their_flags(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with pytest.raises(SystemExit):
         main(["--tyro-print-completion", "bash"])
     script = capsys.readouterr().out
-
-    def completed(*words: str) -> list[str]:
-        """Return the candidates of bash for a line that ends with the last of the words."""
-        line = (
-            f"COMP_WORDS=({shlex.join(words)}); COMP_CWORD={len(words) - 1}; COMP_LINE='{words}'; "
-            '_tyro_megloc; printf "%s\\n" "${COMPREPLY[@]}"'
-        )
-        command = ["bash", "-c", f"{script}\n{line}"]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-
-    assert set(COMMANDS) <= set(completed("megloc", ""))
-    assert completed("megloc", "loc") == ["localize"]
-    assert "--features-dir" in completed("megloc", "match", "--feat")
+    assert all(command in script for command in COMMANDS) and "--features-dir" in script
+    subprocess.run(["bash", "-n"], input=script, text=True, check=True)
 
 
 def test_every_option_is_listed_with_a_meaning(megloc: Any) -> None:
@@ -133,15 +126,3 @@ def test_options_are_listed_by_stage_key_and_plugin(megloc: Any) -> None:
 def test_the_version(megloc: Any) -> None:
     assert megloc("--version").out == f"megloc-kapture {version('megloc-kapture')}\n"
     assert megloc_kapture.__version__ == version("megloc-kapture")
-
-
-def test_no_command_imports_the_web_server_but_serve() -> None:
-    code = """
-import sys
-from megloc_kapture.cli.main import COMMANDS, command_class
-for name in COMMANDS:
-    command_class(name)
-print({"fastapi", "uvicorn", "starlette"} & set(sys.modules))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("set()\n", "")

@@ -54,7 +54,7 @@ def test_a_matcher_is_trained_and_evaluated(megloc: Any, inputs: Path, tmp_path:
 
 
 QUICK = ("--steps", "4", "--max-side", "40", "--device", "cpu")
-HERE = ("--max-side", "60", "--executor", "inline")
+HERE = ("--max-side", "32", "--executor", "inline")
 CAMERA_TEXT = "SIMPLE_PINHOLE,48,36,40,24,18"
 
 
@@ -123,12 +123,11 @@ def test_views_are_rendered_along_the_poses_of_a_folder(
 ) -> None:
     done = megloc("render", field, "--along", mapping, "-o", tmp_path / "rendered", *HERE)
     assert done.out.startswith("7 views rendered")
-    written = KaptureFolder(tmp_path / "rendered")
-    written.validate(deep=True)
+    written = KaptureFolder(tmp_path / "rendered").read()
     poses = KaptureFolder(mapping).read().poses()
-    assert list(written.read().poses().values()) == list(poses.values())
-    camera = written.read().camera_of(written.read().image_names()[0])
-    assert (camera.width, camera.height) == (60, 45)
+    assert list(written.poses().values()) == list(poses.values())
+    camera = written.camera_of(written.image_names()[0])
+    assert (camera.width, camera.height) == (32, 24)
 
 
 def test_views_between_the_cameras_can_be_merged_with_the_map(
@@ -179,6 +178,3 @@ def test_a_map_in_place_of_a_field_and_other_suffixes_are_refused(
     view = (pose_text(mapping), "--camera", CAMERA_TEXT)
     megloc("render", field, *view, "-o", tmp_path / "view.gif").refused("must end in")
     megloc("render", mapping, *view, "-o", tmp_path / "view.png").refused("train-field writes one")
-    train = ("train-field", "-i", mapping, "-o", tmp_path / "out")
-    megloc(*train, "--steps", "0").refused("steps: .*greater than 0")
-    assert not (tmp_path / "out").exists()

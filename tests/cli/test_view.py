@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 from pathlib import Path
@@ -20,8 +21,15 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 
 
+def data_of(page: Path) -> dict[str, Any]:
+    """Return the data of a page of ``megloc view``."""
+    content = page.read_text().partition('id="data">')[2].partition("</script>")[0]
+    data: dict[str, Any] = json.loads(content)
+    return data
+
+
 def test_a_view_shows_a_map_a_result_and_its_errors(
-    megloc: Any, finished: Path, tmp_path: Path, data_of: Any
+    megloc: Any, finished: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "view.html"
     done = megloc("view", finished / "map", "-o", out)

@@ -13,9 +13,7 @@ from corner import CAMERA, depth_m, pose_at, render
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.datasets.megadepth import (
-    import_megadepth,
-)
+from megloc_kapture.datasets.megadepth import import_megadepth
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureFolder
@@ -42,9 +40,8 @@ def write_sample(root: Path, scene: str, *, model: bool) -> None:
         write_image(images / name, render(pose))
         write_depth(depths / f"{Path(name).stem}.h5", depth_m(pose))
     write_image(images / "relative.jpg", render(POSES["0_o.jpg"]))
-    write_depth(
-        depths / "relative.h5", np.where(np.arange(400) < 200, -1.0, 1.0) * np.ones((300, 1))
-    )
+    relative = np.where(np.arange(400) < 200, -1.0, 1.0) * np.ones((300, 1))
+    write_depth(depths / "relative.h5", relative)
     everything = {**POSES, "relative.jpg": POSES["0_o.jpg"], "absent.jpg": POSES["0_o.jpg"]}
     if model:
         lines = []
@@ -134,16 +131,10 @@ def test_missing_scenes_are_named(tmp_path: Path) -> None:
         import_megadepth(tmp_path, tmp_path / "out", ("..",))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({}, "scene 7 has no image with depth"),
-        ({"image_paths": ["../../x.jpg"]}, "x.jpg"),
-    ],
-)
-def test_a_wrong_table_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_a_wrong_table_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scene_info").mkdir()
-    arrays = {"image_paths": ["x.jpg"], "intrinsics": np.eye(3)[None], "poses": np.eye(4)[None]}
-    np.savez(tmp_path / "scene_info" / "7.npz", **{**arrays, **changes})
-    with pytest.raises(DataError, match=message):
-        import_megadepth(tmp_path, tmp_path / "out")
+    arrays = {"intrinsics": np.eye(3)[None], "poses": np.eye(4)[None]}
+    for path, message in (("x.jpg", "scene 7 has no image with depth"), ("../../x.jpg", "x.jpg")):
+        np.savez(tmp_path / "scene_info" / "7.npz", image_paths=[path], **arrays)
+        with pytest.raises(DataError, match=message):
+            import_megadepth(tmp_path, tmp_path / "out")

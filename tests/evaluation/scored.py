@@ -108,7 +108,6 @@ class Page(HTMLParser):
     def __init__(self, html: str) -> None:
         super().__init__()
         self.open: list[str] = []
-        self.scripts: list[str] = []
         self.ids: list[str] = []
         self.references: list[str] = []
         self.pieces: list[str] = []
@@ -125,16 +124,8 @@ class Page(HTMLParser):
     def text(self) -> str:
         return " ".join(" ".join(self.pieces).split())
 
-    @property
-    def images(self) -> list[str]:
-        return [r for r in self.references if r.startswith("data:image/jpeg;base64,")]
-
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.note(attrs)
-        # the one script is ours: no address, and nothing of the data in it
-        if tag == "script":
-            assert not attrs and "script" not in self.scripts
-            self.scripts.append(tag)
         if tag not in VOID_ELEMENTS:
             self.open.append(tag)
 

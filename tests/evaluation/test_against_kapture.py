@@ -108,7 +108,7 @@ def assert_equal_figures(
     np.testing.assert_allclose(result.errors.angle_deg, theirs_by_query[:, 1], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("num_missing", [0, 5, 21, 40])
+@pytest.mark.parametrize("num_missing", [0, 21, 40])
 def test_equal_on_random_poses(num_missing: int, figures_of_kapture: Figures) -> None:
     estimated, truth = random_poses(40, 0.2, 9.0, missing=num_missing)
     assert_equal_figures(estimated, truth, BINS, figures_of_kapture)

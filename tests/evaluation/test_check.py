@@ -11,12 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.check import (
-    CheckReport,
-    Finding,
-    Reference,
-    check_submission,
-)
+from megloc_kapture.evaluation.check import CheckReport, Finding, Reference, check_submission
 from megloc_kapture.io.dataset_tables import (
     Protocol,
     RelocalizationPair,
@@ -155,11 +150,8 @@ GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
     ("line", "kind", "words"),
     [
         ("b.jpg 1 0 0 0 1.5 -0.2", "columns", "7 columns instead of 8 (name qw qx qy qz tx ty tz)"),
-        ("b.jpg", "columns", "1 column instead"),
         ("b.jpg, 0.6, 0.8, 0, 0, 1.5, -0.2", "columns", "separated by blanks, not commas"),
         ("# name qw qx qy qz tx ty tz", "comment", "no header"),
-        ("b.jpg 1 0 0 0 1.5 -0.2 x", "pose", "'x' is not a number"),
-        ("b.jpg 1 0 0 0 nan -0.2 3", "pose", "b.jpg: the pose is not finite"),
         ("b.jpg 0 0 0 0 1 -0.2 3", "pose", "b.jpg: quaternion of length 0, not 1"),
         ("b.jpg 10 20 30 0.6 0.8 0 0", "pose", "the columns are name qw qx qy qz tx ty tz"),
         ("a.jpg 1 0 0 0 1 -0.2 3", "duplicate", "given twice, first on line 1"),

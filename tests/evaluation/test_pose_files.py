@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OutputError
@@ -35,56 +33,23 @@ GOOD = "a.jpg 1 0 0 0 1.5 -0.2 3\n"
 GOOD_PAIR = "100 205 1.5 -0.2 3 0.8 0 0 0.6\n"
 
 
-def unit(values: list[float]) -> tuple[float, float, float, float]:
-    w, x, y, z = (np.array(values) / np.linalg.norm(values)).tolist()
-    return w, x, y, z
-
-
-finite = st.floats(-1e7, 1e7)
-quats = (
-    st.lists(st.floats(-1, 1), min_size=4, max_size=4)
-    .filter(lambda q: np.linalg.norm(q) > 1e-3)
-    .map(unit)
-)
-poses = st.builds(RigidTransform, quats, st.tuples(finite, finite, finite))
-stamps = st.integers(0, 10**19)
-pairs = st.lists(
-    st.builds(RelativePose, stamps, stamps, poses),
-    max_size=5,
-    unique_by=lambda row: (row.reference, row.query),
-)
-names = st.text(
-    st.characters(exclude_categories=["Cc", "Cs", "Z"], codec="utf-8"), min_size=1, max_size=10
-).filter(lambda name: name.split() == [name])
-
-
-@given(st.dictionaries(names, poses, max_size=6), pairs)
-def test_pose_files_round_trip(
-    tmp_path_factory: pytest.TempPathFactory,
-    written: dict[str, RigidTransform],
-    rows: list[RelativePose],
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "round_trip.txt"
-    write_pose_file(path, written)
-    assert read_pose_file(path) == written
-    assert list(read_pose_file(path)) == sorted(written)
-    path.write_text(format_mlad_file(rows))
-    assert read_mlad_file(path) == rows
-
-
 def test_pose_files_have_the_servers_format(tmp_path: Path) -> None:
+    path = tmp_path / "file"
     pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))
     third = RigidTransform((0.5, 0.5, -0.5, 0.5), (1 / 3, -2e-17, 1e6))
-    assert format_pose_file({"q/b.jpg": third, "q/a.jpg": pose}, names="basename") == (
+    write_pose_file(path, {"q/b.jpg": third, "q/a.jpg": pose}, names="basename")
+    assert path.read_text() == (
         "a.jpg 1.0 0.0 0.0 0.0 1.5 -0.2 3.0\n"
         "b.jpg 0.5 0.5 -0.5 0.5 0.3333333333333333 -2e-17 1000000.0\n"
     )
-    pose = RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
-    text = format_mlad_file([RelativePose(1602074877390449152, 5, pose)])
-    assert text == "1602074877390449152 5 1.5 -0.2 3.0 0.8 0.0 0.0 0.6\n"
+    assert read_pose_file(path) == {"a.jpg": pose, "b.jpg": third}
+    row = RelativePose(1602074877390449152, 5, RigidTransform((0.6, 0.8, 0.0, 0.0), (1 / 3, -1, 3)))
+    path.write_text(format_mlad_file([row]))
+    assert path.read_text() == "1602074877390449152 5 0.3333333333333333 -1.0 3.0 0.8 0.0 0.0 0.6\n"
+    assert read_mlad_file(path) == [row]
     assert format_pose_file({}) == format_mlad_file([]) == ""
-    (tmp_path / "file").write_text("")
-    assert read_pose_file(tmp_path / "file") == {} and read_mlad_file(tmp_path / "file") == []
+    path.write_text("")
+    assert read_pose_file(path) == {} and read_mlad_file(path) == []
     with pytest.raises(OutputError, match="file"):
         write_pose_file(tmp_path / "file" / "poses.txt", {"a.jpg": HERE})
 
@@ -99,9 +64,7 @@ def test_the_challenge_s_list_gives_names_and_order() -> None:
 @pytest.mark.parametrize(
     ("pose", "words"),
     [
-        (RigidTransform((1.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0)), "not finite"),
         (RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, math.inf, 0.0)), "not finite"),
-        (RigidTransform((math.nan, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "not finite"),
         (RigidTransform((0.9, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "length 0.9"),
         (None, "pair 1 2 has no pose; MLAD requires every row"),
     ],
@@ -122,16 +85,10 @@ def test_invalid_poses_are_not_written(
     [
         "a.jpg\t1  0 0 0 1.5 -0.2 3 \r\n",
         "\ufeffa.jpg 1 0 0 0 1.5 -0.2 3\n",
-        "\n\na.jpg 1e0 0 0 0 1.5 -.2 +3\n\n",
-        "a.jpg 1.0009 0 0 0 1.5 -0.2 3\n",
-        "a.jpg 1 0 0 0 1.5 -0.2 3",
+        "\n\na.jpg 1.0009 0 0 0 1.5 -.2 +3",
         "# name qw qx qy qz tx ty tz\na.jpg 1 0 0 0 1.5 -0.2 3\n",
         "7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n1.5 2.5 -1 3.5 4.5 17\n",
         "# IMAGE_ID, QW, ...\n7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n\n8 nan 0 0 0 0 0 0 4 b c.jpg\n",
-    ],
-    ids=[
-        *("tabs and crlf", "byte order mark", "empty lines", "slightly off unit length"),
-        *("no newline at the end", "comment", "COLMAP's images.txt", "its header, a failure"),
     ],
 )
 def test_variants_of_other_tools_are_read(tmp_path: Path, text: str) -> None:
@@ -140,42 +97,27 @@ def test_variants_of_other_tools_are_read(tmp_path: Path, text: str) -> None:
     assert read_pose_file(path) == {"a.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))}
 
 
-@pytest.mark.parametrize("row", ["nan nan nan nan nan nan nan", "0 0 0 0 0 0 0", "1 0 0 0 inf 0 0"])
-def test_rows_without_a_pose_are_misses(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, row: str
-) -> None:
+def test_rows_without_a_pose_are_misses(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "poses.txt"
-    path.write_text(f"{GOOD}b.jpg {row}\n")
+    path.write_text(f"{GOOD}b.jpg nan nan nan nan nan nan nan\nc.jpg 0 0 0 0 0 0 0\n")
     assert list(read_pose_file(path)) == ["a.jpg"]
-    assert "rows of nan or zeros are queries without a pose: 1, the first is b.jpg" in caplog.text
-
-
-BROKEN = [
-    ("b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
-    ("b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "is not a number"),
-    ("b.jpg 1 0 0 0 1.5 -0.2 x", "is not a number"),
-    ("b.jpg 1 1 0 0 1 -0.2 3", "length 1.414"),
-    ("b.jpg 1.0011 0 0 0 1 -0.2 3", "length 1.0011"),
-    ("a.jpg 1 0 0 0 1 -0.2 3", "given twice"),
-]
-BROKEN_PAIRS = [
-    ("100 205", "2 columns instead of 9"),
-    ("100 206 0 0 0 0 0 0", "8 columns instead of 9 .src_ts tgt_ts tx"),
-    ("# src tgt", "3 columns"),
-    ("100 206 0 0 0 0 0 0 x", "'x' is not a number"),
-    ("100 206 0 0 nan 0 0 0 1", "pair 100 206: the pose is not finite"),
-    ("100 206 0 0 0 0 0 0.1 1", "length 1.00499"),
-    ("1e2 206 0 0 0 0 0 0 1", "'1e2' is not a timestamp"),
-    ("-100 206 0 0 0 0 0 0 1", "not a timestamp"),
-    ("100 205 0 0 0 0 0 0 1", "pair 100 205 is given twice"),
-]
+    assert "rows of nan or zeros are queries without a pose: 2, the first is b.jpg" in caplog.text
 
 
 @pytest.mark.parametrize(
     ("read", "good", "line", "words"),
-    [(read_pose_file, GOOD, *row) for row in BROKEN]
-    + [(read_mlad_file, GOOD_PAIR, *row) for row in BROKEN_PAIRS]
-    + [(read_mlad_file, "1 2\n", GOOD_PAIR, "9 columns instead of 2, as in the rows before")],
+    [
+        (read_pose_file, GOOD, "b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
+        (read_pose_file, GOOD, "b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "is not a number"),
+        (read_pose_file, GOOD, "b.jpg 1.0011 0 0 0 1 -0.2 3", "length 1.0011"),
+        (read_pose_file, GOOD, "a.jpg 1 0 0 0 1 -0.2 3", "given twice"),
+        (read_mlad_file, GOOD_PAIR, "100 205", "2 columns instead of 9"),
+        (read_mlad_file, GOOD_PAIR, "100 206 0 0 nan 0 0 0 1", "pair 100 206: .* not finite"),
+        (read_mlad_file, GOOD_PAIR, "1e2 206 0 0 0 0 0 0 1", "'1e2' is not a timestamp"),
+        (read_mlad_file, GOOD_PAIR, "-100 206 0 0 0 0 0 0 1", "not a timestamp"),
+        (read_mlad_file, GOOD_PAIR, "100 205 0 0 0 0 0 0 1", "pair 100 205 is given twice"),
+        (read_mlad_file, "1 2\n", GOOD_PAIR, "9 columns instead of 2"),
+    ],
 )
 def test_broken_lines_are_named(
     tmp_path: Path, read: Callable[..., Any], good: str, line: str, words: str
@@ -236,24 +178,21 @@ def test_relative_poses_are_query_from_reference() -> None:
     np.testing.assert_allclose(scaled.translation, 2.5 * np.array(result.translation))
 
 
-@pytest.mark.parametrize("end", ["\n", ""])
-def test_lists_of_pairs(tmp_path: Path, end: str) -> None:
+def test_lists_of_pairs(tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
-    path.write_bytes(b"1600000000000000000 1600000000000000001\r\n\r\n3\t4" + end.encode())
+    path.write_bytes(b"1600000000000000000 1600000000000000001\r\n\r\n3\t4")
     assert read_mlad_file(path) == [
         RelativePose(1600000000000000000, 1600000000000000001),
         RelativePose(3, 4),
     ]
     # and true poses of training files
-    path.write_text(GOOD_PAIR + "100 206 0 0 0 0 0 0 1" + end)
+    path.write_text(GOOD_PAIR + "100 206 0 0 0 0 0 0 1\n")
     first, second = read_mlad_file(path)
     assert first.query_from_reference == RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
     assert second == RelativePose(100, 206, HERE)
 
 
 def test_provenance_has_options_and_the_hash_of_the_file(tmp_path: Path) -> None:
-    import numpy
-
     pose_file = tmp_path / "aachen.txt"
     pose_file.write_text("a.jpg 1 0 0 0 0 0 0\n")
     options = {"preset": "classic", "options": {"max_error_px": 8.0}}
@@ -265,7 +204,4 @@ def test_provenance_has_options_and_the_hash_of_the_file(tmp_path: Path) -> None
     assert content["preset"] == "classic"
     assert content["options"] == {"max_error_px": 8.0}
     assert content["versions"] == package_versions()
-    assert package_versions()["numpy"] == numpy.__version__
-    first = path.read_bytes()
-    again = write_provenance(pose_file, options, counts={"queries": 2, "poses": 1})
-    assert again.read_bytes() == first
+    assert package_versions()["numpy"] == np.__version__

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from scored import evaluate_poses
 
@@ -40,14 +38,11 @@ def result(label: str, errors_m: Sequence[float], **options: Any) -> Evaluation:
     return evaluate_poses(estimated, dict.fromkeys(names, HERE), label=label, **options)
 
 
-@given(st.integers(0, 400), st.integers(0, 400))
-def test_equal_to_scipys_binomial_test(only_first: int, only_second: int) -> None:
-    ours = mcnemar(only_first, only_second)
-    if only_first + only_second == 0:
-        assert ours == 1.0
-        return
-    theirs = stats.binomtest(only_first, only_first + only_second, 0.5).pvalue
-    assert ours == pytest.approx(theirs, rel=1e-9)
+def test_equal_to_scipys_binomial_test() -> None:
+    assert mcnemar(0, 0) == 1.0
+    for only_first, only_second in ((0, 1), (3, 3), (4, 3), (12, 0), (2, 17), (150, 190)):
+        theirs = stats.binomtest(only_first, only_first + only_second, 0.5).pvalue
+        assert mcnemar(only_first, only_second) == pytest.approx(theirs, rel=1e-9)
 
 
 def test_holm_by_hand() -> None:
@@ -85,7 +80,7 @@ def test_tests_of_all_thresholds_and_pairs_are_corrected() -> None:
 
 def test_the_interval_of_a_median_difference_covers_the_true_one() -> None:
     rng = np.random.default_rng(3)
-    num_runs, held = 60, 0
+    num_runs, held = 40, 0
     # log-normal errors: medians 0.1 and 0.13
     for _ in range(num_runs):
         shared = rng.normal(0, 0.7, 90)
@@ -105,25 +100,14 @@ def test_medians_with_missing_poses() -> None:
     assert low == -np.inf and high <= 0.0
 
 
-@pytest.mark.parametrize(
-    ("others", "words"),
-    [
+def test_incomparable_results_are_refused() -> None:
+    first, same = result("A", [0.1, 0.2]), [0.1, 0.3]
+    for others, words in (
         ([], "at least two"),
-        ([("A", [0.1, 0.3], {})], "two results are called 'A'"),
-        (
-            [("B", [0.1, 0.3], {"thresholds": [Threshold(position_m=2.0)]})],
-            "A and B have different thresholds",
-        ),
-        ([("B", [0.1, 0.3, 0.2], {})], "A and B have different queries"),
-        (
-            [("B", [0.1, 0.3], {"conditions": {"0000.jpg": "night"}})],
-            "A and B have different conditions",
-        ),
-    ],
-)
-def test_incomparable_results_are_refused(
-    others: list[tuple[str, list[float], Any]], words: str
-) -> None:
-    results = [result(label, errors, **options) for label, errors, options in others]
-    with pytest.raises(OptionError, match=words):
-        compare([result("A", [0.1, 0.2]), *results])
+        ([result("A", same)], "two results are called 'A'"),
+        ([result("B", same, thresholds=[Threshold(position_m=2.0)])], "different thresholds"),
+        ([result("B", [*same, 0.2])], "A and B have different queries"),
+        ([result("B", same, conditions={"0000.jpg": "night"})], "different conditions"),
+    ):
+        with pytest.raises(OptionError, match=words):
+            compare([first, *others])

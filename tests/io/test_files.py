@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import resource
 import shutil
 from collections.abc import Iterator
@@ -11,24 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import (
-    atomic_write,
-    link_file,
-    link_images,
-    safe_join,
-    write_bytes,
-)
+from megloc_kapture.io.files import atomic_write, link_file, link_images, safe_join, write_bytes
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter
-from megloc_kapture.io.output_folders import (
-    MARKER,
-    claim_folder,
-    files_below,
-    staged_output,
-)
+from megloc_kapture.io.output_folders import MARKER, claim_folder, files_below, staged_output
 
 
 def test_a_file_is_written_with_its_folders_and_the_umask(tmp_path: Path) -> None:
@@ -124,25 +110,13 @@ def test_a_linked_file_replaces_an_older_file(source: Path, tmp_path: Path) -> N
 # -------------------------------------------------------------------------------------------- paths
 
 
-@given(st.text(alphabet=st.sampled_from("./\\a b\0\n\udc80,")))
-@example("")
-@example("/a")
-@example("../a")
-@example("a/../b")
-@example("a//b")
-@example("a\\b")
-@example("..a/b..")
-@example("é/ü 1.png")
-@example("a/...b")
-def test_a_joined_path_is_refused_or_stays_below_the_root(name: str) -> None:
-    try:
-        path = safe_join(Path("/root"), name)
-    except DataError:
-        assert re.search(r"^$|^/|//|/$|\\|[\0\n\udc80]|(^|/)\.\.?(/|$)", name)
-        return
-    assert path.is_relative_to("/root")
-    assert path != Path("/root")
-    assert str(path) == f"/root/{name}"  # each file has one accepted name
+def test_a_joined_path_is_refused_or_stays_below_the_root() -> None:
+    for name in ("..a/b..", "é/ü 1.png", "a/...b", "a, b.jpg"):
+        assert safe_join(Path("/root"), name) == Path("/root", name)
+    above = ("", "/a", "..", "../a", "a/../b", "a/..", "./a", "a//b", "a/")
+    for name in (*above, "a\\b", "a\0b", "a\nb", "\udc80"):
+        with pytest.raises(DataError):
+            safe_join(Path("/root"), name)
 
 
 # ------------------------------------------------------------------------------- output folders
@@ -165,16 +139,14 @@ def foreign(tmp_path: Path) -> Path:
     return place
 
 
-@pytest.mark.parametrize("made", [True, False])
-def test_a_new_or_empty_folder_is_claimed(tmp_path: Path, made: bool) -> None:
-    place = tmp_path / "a" / "b"
-    if made:
-        place.mkdir(parents=True)
-    claim_folder(place, kind="map")
-    assert (place / MARKER).read_text() == "map\n"
-    claim_folder(place, kind="map")
-    (place / "file").touch()
-    claim_folder(place, kind="map")
+def test_a_new_or_empty_folder_is_claimed(tmp_path: Path) -> None:
+    new, empty = tmp_path / "a" / "b", tmp_path / "empty"
+    empty.mkdir()
+    for place in (new, empty):
+        claim_folder(place, kind="map")
+        assert (place / MARKER).read_text() == "map\n"
+        (place / "file").touch()
+        claim_folder(place, kind="map")
 
 
 def test_a_folder_of_other_files_is_refused_unless_forced(foreign: Path) -> None:

@@ -67,9 +67,7 @@ def spread(low: float, high: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("name", "deep"),
     [
-        ("10_bits.png", spread(0, 1020).astype(np.uint16)),
         ("thermal.png", spread(8000, 8765).astype(np.uint16)),
-        ("full.png", spread(0, 65535).astype(np.uint16)),
         ("float.tif", spread(0, 1).astype(np.float32)),
         ("long.tif", spread(-5000, 5000).astype(np.int32)),
     ],
@@ -84,14 +82,6 @@ def test_the_used_range_of_deep_images_becomes_8_bits(
     with Image.open(tmp_path / name) as image:
         assert np.array_equal(pillow_pixels(image), pixels)
     assert capfd.readouterr().err == ""
-
-
-def test_pixels_are_read_as_stored_whatever_the_exif_orientation(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6  # "rotate by 90 degrees to view"
-    Image.fromarray(SMOOTH).save(tmp_path / "a.jpg", exif=exif, quality=95)
-    assert read_image_rgb(tmp_path / "a.jpg").shape == (40, 60, 3)
-    assert image_size(tmp_path / "a.jpg") == (60, 40)
 
 
 def test_depth_maps_read_back(tmp_path: Path) -> None:
@@ -128,10 +118,8 @@ def noise(width: int = 64, height: int = 48) -> Image.Image:
     ("tags", "inner"),
     [
         ({}, {}),
-        ({}, {FOCAL_35MM: 28}),
         ({ORIENTATION: 6}, {FOCAL_35MM: 50}),
         ({MAKE: "Canon", MODEL: "Canon PowerShot S95"}, {FOCAL_MM: IFDRational(6)}),
-        ({MAKE: "NIKON CORPORATION", MODEL: "NIKON D70"}, {FOCAL_MM: IFDRational(18)}),
         ({MAKE: "Nobody", MODEL: "Nothing"}, {FOCAL_MM: IFDRational(18)}),
         (
             {MAKE: "x", MODEL: "y"},
@@ -155,8 +143,7 @@ def test_the_camera_of_a_photograph_is_that_of_colmap(
 
 
 @pytest.mark.parametrize(
-    ("orientation", "suffix"),
-    [*((number, ".jpg") for number in range(1, 9)), (6, ".png"), (6, ".webp"), (6, ".tif")],
+    ("orientation", "suffix"), [*((number, ".jpg") for number in range(1, 9)), (6, ".tif")]
 )
 def test_pixels_and_camera_are_rotated_as_pillow_does(
     orientation: int, suffix: str, tmp_path: Path
@@ -174,13 +161,8 @@ def test_pixels_and_camera_are_rotated_as_pillow_does(
 
 
 def test_the_gps_position_of_a_photograph() -> None:
-    position = {
-        1: "N",
-        2: (47, IFDRational(45, 2), IFDRational(0, 0)),
-        3: "W",
-        4: (8.0, 32.5),
-        6: 400,
-    }
+    latitude = (47, IFDRational(45, 2), IFDRational(0, 0))
+    position = {1: "N", 2: latitude, 3: "W", 4: (8.0, 32.5), 6: 400}
     image = noise()
     exif = exif_of({MAKE: "Acme\0", MODEL: "P1", ORIENTATION: 6}, {FOCAL_35MM: 28})
     exif.get_ifd(0x8825).update(position)

@@ -60,7 +60,6 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ("name", "row", "message"),
     [
         ("sensors/records_camera.txt", "1, cam", "expected 3 columns, got 2"),
-        ("sensors/records_camera.txt", "1.5, cam, a.jpg", "invalid literal for int.* '1.5'"),
         ("sensors/records_camera.txt", "9, nocam, a.jpg", "unknown sensor or rig 'nocam'"),
         ("sensors/records_camera.txt", "9, deep, a.jpg", "of type 'depth', not 'camera'"),
         ("sensors/records_camera.txt", "0, cam, b.jpg", "timestamp 0 of 'cam' is listed twice"),
@@ -70,7 +69,6 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         ("sensors/trajectories.txt", "1, cam, nan, 0, 0, 0, 0, 0, 0", "finite numbers qw"),
         ("sensors/trajectories.txt", "1, cam, 0.998, 0, 0, 0, 0, 0, 0", "not a unit quaternion"),
         ("sensors/trajectories.txt", "1, cam, 1, 0, 0, , 0, 0, 0", "some but not all"),
-        ("sensors/trajectories.txt", f"0, rig, {IDENTITY}", "unknown sensor or rig 'rig'"),
         ("sensors/sensors.txt", "x, ", "at least 3 columns"),
         ("sensors/sensors.txt", "cam, n, gnss", "'cam' is empty or listed twice"),
         ("sensors/sensors.txt", "x, n, camera", "expected a camera model, width, height"),
@@ -164,7 +162,6 @@ def test_wrong_points_are_named(tmp_path: Path, row: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("5, t, a", "expected point3d_id"),
         ("5, t, a, 1, b", "expected point3d_id"),
         ("x, t, a, 1", "expected point3d_id"),
         ("5, t, a, -1", "ids from 0 on"),
@@ -216,7 +213,7 @@ def test_a_depth_map_of_another_size_or_a_missing_one_is_named(tmp_path: Path) -
         read_depth_map(tmp_path / "b.depth", width=3, height=2)
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 def test_truncated_images_are_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / ("a" + suffix)
     pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)

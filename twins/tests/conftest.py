@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from megloc_twins import render
@@ -19,6 +19,10 @@ from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
 from megloc_twins.surfaces import Atlas, build_atlas
 from megloc_twins.synthetic_kapture import SyntheticKapture, SyntheticWorld, build_world
 from megloc_twins.textures import TextureRecipe
+
+from megloc_kapture.datasets.official import write_official
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import DATASETS
 
 SIZE = {"width": 160, "height": 120, "supersampling": 1}
 PLACES = {"num_places": 2, "day_queries": 2, "night_queries": 2}
@@ -44,18 +48,24 @@ SMALL: dict[str, SyntheticDataset[Any]] = {
 
 
 def _plain_atlas(recipes: Iterable[TextureRecipe]) -> Atlas:
-    """Smooth random colours: layouts and poses do not depend on the textures, which take long."""
-    textures = []
-    for recipe in recipes:
-        coarse = np.random.default_rng(recipe.seed).integers(60, 200, (3, 3, 3), np.uint8)
-        textures.append(cv2.resize(coarse, (recipe.width, recipe.height)))
-    return build_atlas(textures)
+    """Random colours of 3 x 3 texels: layouts and poses do not depend on textures."""
+    seeds = [recipe.seed for recipe in recipes]
+    return build_atlas(
+        [np.random.default_rng(seed).integers(60, 200, (3, 3, 3), np.uint8) for seed in seeds]
+    )
 
 
-def _write_plain(dataset: SyntheticDataset[Any], root: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render, "painted", _plain_atlas)
-        dataset.write(root)
+@pytest.fixture(scope="session")
+def plain_textures() -> Callable[[], AbstractContextManager[None]]:
+    """Function: a context in which renderers paint small random textures."""
+
+    @contextmanager
+    def patched() -> Iterator[None]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(render, "painted", _plain_atlas)
+            yield
+
+    return patched
 
 
 @pytest.fixture(scope="session")
@@ -71,9 +81,29 @@ def small() -> dict[str, SyntheticDataset[Any]]:
 
 
 @pytest.fixture(scope="session")
-def rendered(written_once: Callable[..., Path]) -> Callable[[str], Path]:
-    """Folder of the small dataset in a layout; not to be written into."""
-    return lambda name: written_once(f"rendered_{name}", partial(_write_plain, SMALL[name]))
+def rendered(
+    written_once: Callable[..., Path], plain_textures: Callable[[], AbstractContextManager[None]]
+) -> Callable[[str], Path]:
+    """Function: folder of the small dataset in a layout; not to be written into."""
+
+    def folder(name: str) -> Path:
+        with plain_textures():
+            return written_once(f"rendered_{name}", SMALL[name].write)
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def imported(
+    written_once: Callable[..., Path], rendered: Callable[[str], Path]
+) -> Callable[[str], Path]:
+    """Function: import of the small dataset in a layout; not to be written into."""
+
+    def folder(name: str) -> Path:
+        dataset = load_plugin(DATASETS, name).read(rendered(name))
+        return written_once(f"imported_{name}", partial(write_official, dataset))
+
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -4,70 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import kapture
-import numpy as np
-import pytest
-from kapture.io.csv import kapture_from_dir
-
-from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
-from megloc_kapture.datasets.official import write_official
-from megloc_kapture.io.kapture import KaptureFolder
-
-import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
-
 LAYOUT = "aachen"
 
 NUM_DATABASE, NUM_SEQUENCE = 30, 6
 
 
-@pytest.fixture(scope="module", params=["1.0", "1.1"])
-def imported(
-    request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """Import the twin by the adapter."""
-    out = tmp_path_factory.mktemp("imported") / request.param
-    write_official(Aachen(AachenOptions(version=request.param)).read(root), out)
-    return out
-
-
-def cameras_by_image(folder: Path) -> dict[str, list[str]]:
-    data = kapture_from_dir(str(folder))
-    return {
-        image: data.sensors[sensor].sensor_params
-        for _, sensor, image in kapture.flatten(data.records_camera)
-    }
-
-
 def listed(path: Path) -> list[list[str]]:
     return [line.split() for line in path.read_text().split("\n")]
-
-
-def test_versions(imported: Path) -> None:
-    mapping, query = cameras_by_image(imported / "mapping"), cameras_by_image(imported / "query")
-    sensors = kapture_from_dir(str(imported / "mapping")).sensors
-    num_added = sum(name.startswith("query/night/nexus5x_additional_night/") for name in query)
-    in_sequences = sum(name.startswith("sequences/") for name in mapping)
-    in_database = sum(name.startswith("db/") for name in mapping)
-    result = (in_database, in_sequences, len(mapping), len(sensors), len(query), num_added)
-    # each sequence has one camera
-    newer = (NUM_DATABASE, NUM_SEQUENCE, NUM_DATABASE + NUM_SEQUENCE, NUM_DATABASE + 2, 8, 2)
-    older = (NUM_DATABASE, 0, NUM_DATABASE, NUM_DATABASE, 6, 0)
-    assert result == (older if imported.name == "1.0" else newer)
-
-
-def test_colmap_reads_the_added_model(root: Path) -> None:
-    # the official frame is far from the origin
-    poses = KaptureFolder(root / "ground_truth/mapping").read().poses().values()
-    assert min(np.linalg.norm(pose.center()) for pose in poses) > 500
-    cameras = cameras_by_image(root / "ground_truth/mapping").values()
-    assert any(int(params[1]) < int(params[2]) for params in cameras)  # portraits
-    model = pycolmap.Reconstruction(str(root / "3D-models/aachen_v_1_1"))
-    assert model.num_reg_images() == NUM_DATABASE + NUM_SEQUENCE
-    assert len(model.cameras) == NUM_DATABASE + 2
-    model.update_point_3d_errors()
-    assert 0 < model.compute_mean_reprojection_error() < 1e-3
-    ids = {image.name: image_id for image_id, image in model.images.items()}
-    assert sorted(ids, key=lambda name: ids[name]) != sorted(ids)
 
 
 def test_quirks_of_the_layout(root: Path) -> None:

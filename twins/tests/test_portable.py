@@ -24,8 +24,9 @@ def test_enlarging_is_opencvs(
     np.testing.assert_allclose(resized(image, *size, cubic=cubic), expected, atol=2e-5)
 
 
-@pytest.mark.parametrize("deviation_px", [0.5, 0.8, 1.1, 3.0])
-@pytest.mark.parametrize("shape", [(40, 50, 3), (8, 9)])
+@pytest.mark.parametrize(
+    ("deviation_px", "shape"), [(0.5, (40, 50, 3)), (3.0, (40, 50, 3)), (1.1, (8, 9))]
+)
 def test_blurring_is_opencvs(deviation_px: float, shape: tuple[int, ...]) -> None:
     image = np.random.default_rng(1).random(shape, dtype=np.float32)
     size = 2 * round(4 * deviation_px) + 1
@@ -33,7 +34,7 @@ def test_blurring_is_opencvs(deviation_px: float, shape: tuple[int, ...]) -> Non
     np.testing.assert_allclose(blurred(image, deviation_px), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("factor", [1, 2, 3, 8])
+@pytest.mark.parametrize("factor", [1, 3, 8])
 def test_averaging_leaves_out_what_fills_no_square(factor: int) -> None:
     image = np.random.default_rng(2).random((49, 66, 3), dtype=np.float32)
     height, width = 49 // factor, 66 // factor

@@ -3,9 +3,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from megloc_twins.frames import looking_at, reduced
+from megloc_twins.frames import reduced
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.rasterization import (
     NO_SURFACE,
@@ -72,40 +72,7 @@ def test_samples_are_the_centres_of_equal_cells() -> None:
     np.testing.assert_allclose(project(reduced(camera, 8), point), project(camera, point) / 8)
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
-@pytest.mark.parametrize("tilt", [0.0, 0.9, -1.2])
-def test_depth_is_that_of_the_plane(camera: Camera, tilt: float) -> None:
-    surfaces = rectangle((0.2, -0.1, 6.0), 40.0, 40.0, tilt=tilt)
-    seen = visible_surfaces(surfaces, RigidTransform.identity(), sample_grid(camera, 1))
-    assert (seen.surface == 0).mean() > 0.7
-    rays = colmaps_rays(camera)
-    # the plane through (0.2, -0.1, 6) along (cos, 0, sin): z = 6 + (x - 0.2) tan(tilt)
-    expected = (6.0 - 0.2 * np.tan(tilt)) / (1 - rays[:, 0] * np.tan(tilt))
-    hit = (seen.surface == 0).ravel()
-    np.testing.assert_allclose(depth_map(seen).ravel()[hit], expected[hit], rtol=1e-6)
-    assert (depth_map(seen).ravel()[~hit] == 0).all()
-
-
-def test_the_nearest_surface_hides_the_others_in_any_order() -> None:
-    near, far = rectangle((0, 0, 3.0), 1.0, 1.0), rectangle((0, 0, 5.0), 8.0, 8.0)
-    grid = sample_grid(CAMERAS[0], 1)
-    for surfaces, index in ((near.joined(far), 0), (far.joined(near), 1)):
-        seen = visible_surfaces(surfaces, RigidTransform.identity(), grid)
-        assert seen.surface[30, 40] == index
-        assert depth_map(seen)[30, 40] == pytest.approx(3.0)
-        assert depth_map(seen)[5, 5] == pytest.approx(5.0)
-
-
-def test_surfaces_are_invisible_from_behind() -> None:
-    surfaces = rectangle((0, 0, 3.0), 1.0, 1.0)
-    behind = looking_at(np.array([0.0, 0.0, 6.0]), 0.0, 0.0, 0.0)
-    turned = RigidTransform.from_matrix(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 6.0]))
-    grid = sample_grid(CAMERAS[0], 1)
-    assert (visible_surfaces(surfaces, RigidTransform.identity(), grid).surface == 0).any()
-    for pose in (behind, turned):
-        assert (visible_surfaces(surfaces, pose, grid).surface == NO_SURFACE).all()
-
-
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10**6), camera=st.sampled_from(CAMERAS))
 def test_visibility_equals_a_search_over_all_surfaces_and_samples(
     seed: int, camera: Camera

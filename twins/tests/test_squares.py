@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 from megloc_twins.frames import looking_at
@@ -9,14 +7,12 @@ from megloc_twins.moving_objects import (
     FloorPlan,
     MovingObject,
     Obstacle,
-    draw_floor_plan,
     moving_object_recipes,
     moving_object_surfaces,
 )
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_twins.squares import Place, build_place
-from scipy.spatial import cKDTree
 
 from megloc_kapture.values import Camera
 
@@ -28,19 +24,11 @@ def places() -> list[Place]:
     return [build_place(OPTIONS, index) for index in range(OPTIONS.num_places)]
 
 
-def test_places_lie_apart_and_are_a_few_metres_across(places: list[Place]) -> None:
-    assert len(places) >= 3
-    plans = [place.surfaces_in_world().corners().reshape(-1, 3)[:, :2] for place in places]
-    assert all(10 < np.ptp(plan, axis=0).max() < 35 for plan in plans)
-    for first, second in combinations(plans, 2):
-        assert cKDTree(first).query(second)[0].min() >= 50
-
-
 def test_from_the_rigs_path_there_is_no_hole_in_the_walls(places: list[Place]) -> None:
     camera = Camera("SIMPLE_PINHOLE", 64, 48, (32.0, 32.0, 24.0))
     grid = sample_grid(camera, 1)
     for place in places:
-        for spot, _ in place.plan.stops(5):
+        for spot, _ in place.plan.stops(3):
             position = np.array([*spot, 1.9])
             for yaw in np.arange(4) * np.pi / 2:
                 seen = visible_surfaces(place.surfaces, looking_at(position, yaw, 0, 0), grid)
@@ -57,16 +45,6 @@ def test_a_floor_plan_knows_what_is_free() -> None:
     assert not plan.is_free(6.0, 0.0, 0.1)
     assert plan.is_free(3.5, 0.0, 0.4) and not plan.is_free(3.5, 0.0, 0.6)
     assert plan.distance_to_path(0.0, 0.0) == pytest.approx(2.5)
-
-
-@pytest.mark.parametrize("index", range(4))
-def test_the_rigs_path_keeps_off_walls_and_its_stops_are_evenly_spread(index: int) -> None:
-    plan = draw_floor_plan(stream(0, "plan"), index)
-    stops = plan.stops(12)
-    assert len(stops) == 12
-    assert all(plan.is_free(x, y, 1.4) for (x, y), _ in stops)
-    steps = np.linalg.norm(np.diff([spot for spot, _ in stops], axis=0), axis=1)
-    assert steps.max() < 4.0
 
 
 def test_every_mover_is_a_closed_body_of_its_size() -> None:

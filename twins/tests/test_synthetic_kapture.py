@@ -8,7 +8,6 @@ import numpy as np
 from kapture.io.csv import kapture_from_dir
 from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.synthetic_kapture import (
-    SENSOR_FROM_RIG,
     SyntheticWorld,
     build_world,
     depth_name,
@@ -45,15 +44,6 @@ def test_every_query_shares_its_view_with_the_map_of_its_place_only(world: Synth
         assert max(shares.values()) < 0.9
         assert support(views[query.name], here) > 0.5
         assert all(shares[m.name] == 0 for m in world.mapping if m.place != query.place)
-
-
-def test_poses_of_the_map_are_those_of_the_rig(world: SyntheticWorld) -> None:
-    assert len(world.rig_from_world) * 3 == len(world.mapping)
-    for frame in world.mapping:
-        expected = SENSOR_FROM_RIG[frame.sensor_id] @ world.rig_from_world[frame.timestamp]
-        assert_same(frame.cam_from_world, expected)
-    offsets = [pose.center() for pose in SENSOR_FROM_RIG.values()]
-    assert max(np.linalg.norm(a - b) for a in offsets for b in offsets) > 0.5
 
 
 def test_the_same_options_give_the_same_world_and_others_another() -> None:

@@ -11,7 +11,7 @@ SURFACE = (("material", "brick"), ("material_seed", 3.0))
 
 def recipe(painter: str, seed: int = 5) -> TextureRecipe:
     params = SURFACE if painter in ("wall", "ground") else ()
-    return TextureRecipe(painter, 200, 160, seed, params)
+    return TextureRecipe(painter, 100, 80, seed, params)
 
 
 @pytest.mark.parametrize("painter", sorted(PAINTERS))
@@ -19,7 +19,7 @@ def test_a_recipe_gives_the_same_picture_each_time_and_another_for_another_seed(
     painter: str,
 ) -> None:
     picture = recipe(painter).paint()
-    assert picture.shape == (160, 200, 3)
+    assert picture.shape == (80, 100, 3)
     assert picture.dtype == np.uint8
     np.testing.assert_array_equal(picture, recipe(painter).paint())
     if painter != "glow":  # lamps all look alike
@@ -35,7 +35,7 @@ def test_noise_is_normalised_and_periodic_noise_and_materials_repeat() -> None:
     periodic = periodic_noise(rng, 128, cell=32)
     step = np.abs(np.diff(periodic, axis=0)).mean()
     assert np.abs(periodic[0] - periodic[-1]).mean() < 1.5 * step
-    for kind in ("brick", "stone", "plaster", "paving", "asphalt"):
+    for kind in ("brick", "asphalt"):
         tile = material_tile(kind, 0)
         for axis in (0, 1):
             inside = np.abs(np.diff(tile, axis=axis)).mean(axis=(1 - axis, 2))

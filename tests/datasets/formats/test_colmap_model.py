@@ -124,16 +124,8 @@ def test_a_wrong_text_model_is_named(
     assert str(caught.value).startswith(str(tmp_path))
 
 
-@pytest.mark.parametrize(
-    ("model", "params"),
-    [
-        ("SIMPLE_DIVISION", (500.0, 320.0, 240.0, 0.01)),
-        ("RAD_TAN_THIN_PRISM_FISHEYE", (500.0, 500.0, 320.0, 240.0, *[0.001] * 12)),
-    ],
-)
-def test_camera_models_that_kapture_lacks_are_refused_by_name(
-    tmp_path: Path, model: str, params: tuple[float, ...]
-) -> None:
+def test_camera_models_that_kapture_lacks_are_refused_by_name(tmp_path: Path) -> None:
+    model, params = "SIMPLE_DIVISION", (500.0, 320.0, 240.0, 0.01)
     camera = pycolmap.Camera(camera_id=1, model=model, width=640, height=480, params=params)
     written = pycolmap.Reconstruction()
     written.add_camera_with_trivial_rig(camera)

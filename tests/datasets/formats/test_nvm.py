@@ -64,12 +64,11 @@ def check_model(model: NvmModel) -> None:
     assert dtypes == [np.float64, np.uint8, np.int64, np.int32, np.int32, np.float32]
 
 
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_a_model_is_read_with_any_line_ends_and_trailer(tmp_path: Path, end: str) -> None:
-    for tail in ([], [""], ["0"], ["", "0", "", "some PLY stuff"]):
+def test_a_model_is_read_with_any_line_ends_and_trailer(tmp_path: Path) -> None:
+    for tail, end in (([], "\n"), ([""], "\r\n"), (["0"], "\n"), (["", "0", "", "PLY"], "\r\n")):
         model = read_nvm(file(tmp_path / "m.nvm", MODEL + tail, end))
         check_model(model)
-    model = read_nvm(file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"], end))
+    model = read_nvm(file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"]))
     assert model.names == ("db/7.jpg",) and len(model.points) == 0
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from megloc_kapture.datasets import fourseasons, inloc, robotcar
+from megloc_kapture.datasets import fourseasons, robotcar
 from megloc_kapture.values import Camera, RigidTransform
 
 PINHOLE = "Pinhole 501.5 502.5 421.8 167.7 0.0 0.0 0.0 0.0\n800 400\ncrop\n800 400\n"
@@ -49,11 +49,6 @@ def test_transformations_are_read_in_any_order(write: Callable[[str], Path], ord
     assert scale == 0.9624
     _, _, no_scale = fourseasons.read_transformations(write("".join(TRANSFORMATIONS[:4])))
     assert no_scale is None
-
-
-def test_numbers_of_wrong_scans_are_read(write: Callable[[str], Path]) -> None:
-    path = write("known wrong:\n\n008\nDUC_scan_12.ptx 31\n2017\n")
-    assert inloc.read_wrong_scans(path) == {"008", "012", "031"}
 
 
 def test_names_of_images_have_condition_camera_and_time() -> None:

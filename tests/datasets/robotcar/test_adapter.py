@@ -15,6 +15,7 @@ from megloc_kapture.datasets.robotcar import ImageKey
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.datasets.robotcar.images import rig_of_model
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -38,7 +39,7 @@ def scored(dataset: OfficialDataset) -> set[str]:
     return {name for name, group in dataset.groups.items() if group.scored}
 
 
-@pytest.mark.parametrize("model", ["auto", "merged", "individual"])
+@pytest.mark.parametrize("model", ["merged", "individual"])
 def test_map_poses_and_the_rig_follow_the_models_and_extrinsics(
     downloaded: Path, model: str
 ) -> None:
@@ -113,11 +114,7 @@ def test_conditions_locations_and_priors_come_from_folders_and_lists(downloaded:
     assert (query.condition, query.location, query.scored) == ("night", "001/right", False)
     assert dataset.priors[query_name(13, "right")] == ("001/right",)
     assert dataset.priors.keys() == set(dataset.query.image_names())
-    protocol = dataset.protocol
-    assert protocol.thresholds == ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-    assert set(protocol.pools["night-all"]) == {"night", "night-rain"}
-    pools = set(protocol.pools["day-all"]) | set(protocol.pools["night-all"])
-    assert pools == set(protocol.conditions)
+    assert dataset.protocol.pools == protocol_of("robotcar").pools
 
 
 def test_without_some_individual_models_the_prior_is_the_camera(root: Path) -> None:

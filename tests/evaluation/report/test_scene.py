@@ -19,11 +19,7 @@ from kapture.io.csv import kapture_from_dir
 from scored import evaluate_poses, upright_camera, write_kapture
 
 from megloc_kapture.evaluation import view as scenes
-from megloc_kapture.evaluation.report.queries import (
-    StoredInliers,
-    legend,
-    shown_queries,
-)
+from megloc_kapture.evaluation.report.queries import StoredInliers, legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.view import Scene, render_view, scene_of
@@ -121,12 +117,12 @@ def evaluation_of(world: Any) -> Evaluation:
 
 
 @pytest.mark.parametrize(
-    ("camera", "offset"), [*((camera, 0.0) for camera in CAMERAS), (CAMERAS[0], 4.2e6)]
+    ("camera", "offset"), [(CAMERAS[0], 4.2e6), *((camera, 0.0) for camera in CAMERAS[1:])]
 )
 def test_view_data_equal_kapture(make_map: Any, camera: Camera, offset: float) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack(
-        [rng.normal((offset, 0, 0), 5, (500, 3)), rng.integers(0, 256, (500, 3))]
+        [rng.normal((offset, 0, 0), 5, (50, 3)), rng.integers(0, 256, (50, 3))]
     )
     root = make_map([f"m/{k}.jpg" for k in range(6)], camera, points, offset)
     scene = drawn(root)
@@ -146,12 +142,9 @@ def test_large_scenes_are_subsampled(make_map: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr(scenes, "MAX_POINTS", 600)
     root = make_map([f"m/{k:03d}.jpg" for k in range(30)], CAMERAS[0], points)
     scene = drawn(root)
-    assert len(scene.cameras) == 10
+    assert len(scene.cameras) == 10 and len(scene.points) == 600
     assert "600 of the map's 900 points" in scene.notes[0]
     assert "10 of the map's 30 cameras" in scene.notes[1]
-    page = render_view(scene)
-
-    assert render_view(drawn(root)) == page
     known = {tuple(row) for row in np.float32(points[:, :3] - scene.origin).tolist()}
     assert {tuple(row) for row in scene.points.tolist()} <= known
 

@@ -60,41 +60,15 @@ def test_sensors_of_version_1_0_are_read(tmp_path: Path) -> None:
     assert set(data.sensors) == {"cam", "cam2", "deep", "gps"}
 
 
-@pytest.mark.parametrize("pose", [", , , , 1, 2, 3", "1, 0, 0, 0, , ,", " , , , , , , "])
-def test_a_pose_without_rotation_or_translation_is_skipped(tmp_path: Path, pose: str) -> None:
-    data = read(tmp_path, trajectories=VERSION + f"0, cam, {IDENTITY}\n1, cam, {pose}\n")
-    assert set(data.trajectories) == {(0, "cam")}
-
-
 def test_almost_unit_quaternions_are_normalised(tmp_path: Path) -> None:
-    rows = "0, cam, 1.0009, 0, 0, 0, 0, 0, 0\n1, cam, 0.5, 0.5, 0.5, 0.4999, 0, 0, 0\n"
+    rows = "0, cam, 0, 1.0009, 0, 0, 0, 0, 0\n"
     poses = read(tmp_path, trajectories=VERSION + rows).trajectories
-    assert poses[0, "cam"].quat_wxyz == (1, 0, 0, 0)
-    assert abs(np.linalg.norm(poses[1, "cam"].quat_wxyz) - 1) < 1e-15
+    assert poses[0, "cam"].quat_wxyz == (0, 1, 0, 0)
 
 
 def test_rigs_skip_sensors_that_are_not_listed(tmp_path: Path) -> None:
     data = read(tmp_path, rigs=VERSION + f"rig, gone, {IDENTITY}\nrig, cam, {IDENTITY}\n")
     assert set(data.rigs["rig"]) == {"cam"}
-
-
-# ------------------------------------------------------------------------------------- writing
-
-
-def test_written_data_reads_back_equal_and_is_written_again_with_the_same_bytes(
-    tmp_path: Path, nested: KaptureData
-) -> None:
-    """test_interop.py reads them with kapture."""
-
-    def content() -> dict[str, bytes]:
-        return {path.name: path.read_bytes() for path in (tmp_path / "sensors").iterdir()}
-
-    nested.trajectories[-(10**20), "left"] = turn(1 / 3, 1e-300, -5e-324, 1e9)
-    write_sensors(tmp_path, nested)
-    before = content()
-    assert read_kapture_data(tmp_path) == nested
-    write_sensors(tmp_path, read_kapture_data(tmp_path))
-    assert content() == before
 
 
 def test_a_table_that_is_empty_now_is_removed(tmp_path: Path, nested: KaptureData) -> None:
