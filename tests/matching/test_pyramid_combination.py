@@ -109,6 +109,7 @@ def test_variants_of_both_images_add_to_both() -> None:
     combined = combine(BASE, tried, "all", (first, second))
     # the variant with more matches comes first; row 1 of the first image is matched
     assert combined.matches.tolist() == [[0, 0], [1, 1], [2, 4], [3, 3]]
+    assert combined.best is None  # neither has more matches than the base
     assert combined.added[0].tolist() == [[0, 0]] and combined.added[1].tolist() == [[1, 0]]
 
 

@@ -148,12 +148,14 @@ def test_points_behind_a_camera_do_not_pass() -> None:
     points, in_a, in_b = scene(PINHOLE, PINHOLE, count=100)
     behind = points.copy()
     behind[:50] *= -1  # the same ray in a, behind it
+    behind[50:65] *= (0.1, 0.1, -0.01)  # between the cameras: behind a, in front of b
     rays_a = np.column_stack([behind[:, :2] / behind[:, 2:], np.ones(100)])
     in_b_frame = B_FROM_A.apply(behind)
     rays_b = np.column_stack([in_b_frame[:, :2] / in_b_frame[:, 2:], np.ones(100)])
     # all of them lie on their epipolar lines exactly
     matches = (*undistorted(rays_a, 500.0), *undistorted(rays_b, 500.0))
     assert sampson_error_px(*matches, B_FROM_A).max() < 1e-9
+    assert (in_b_frame[50:65, 2] > 0).all()
     expected = (behind[:, 2] > 0) & (in_b_frame[:, 2] > 0)
     np.testing.assert_array_equal(in_front_of_both(rays_a, rays_b, B_FROM_A), expected)
     np.testing.assert_array_equal(verify_with_poses(*matches, B_FROM_A), expected)
