@@ -112,14 +112,3 @@ def test_unusable_python_is_refused_in_one_line() -> None:
     )
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(r"Python 3\.11 or newer is needed.*\n", done.stderr)
-
-
-def test_help_names_every_target() -> None:
-    makefile = (REPOSITORY / "Makefile").read_text()
-    phony = re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)
-    assert phony is not None
-    shown = subprocess.run(
-        ["make", "--no-print-directory", "help"], cwd=REPOSITORY, capture_output=True, text=True
-    ).stdout
-    for target in set(phony.group(1).split()) - {"help", "venv"}:
-        assert re.search(rf"^make {target} ", shown, re.MULTILINE), target

@@ -16,25 +16,16 @@ from megloc_kapture.features.superpoint import SuperPointNet
 from megloc_kapture.io.images import read_image_rgb
 
 
-def random_superpoint(seed: int) -> SuperPointNet:
-    torch.manual_seed(seed)
+@pytest.fixture(scope="session")
+def superpoint_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
     net = SuperPointNet()
     for name, value in net.named_parameters():
         if name.endswith("weight"):
             nn.init.kaiming_normal_(value)
-    return net
-
-
-@pytest.fixture(scope="session")
-def superpoint_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("superpoint") / "superpoint_v1.pth"
-    torch.save(random_superpoint(0).state_dict(), path)
+    torch.save(net.state_dict(), path)
     return path
-
-
-@pytest.fixture(scope="session")
-def other_superpoint() -> dict[str, torch.Tensor]:
-    return random_superpoint(1).state_dict()
 
 
 @pytest.fixture(scope="session")

@@ -135,20 +135,6 @@ def test_unsuitable_weights_are_named() -> None:
         aslfeat_from(state, "model.ckpt")
 
 
-@pytest.mark.parametrize("image", ["even", "odd"])
-def test_maps_equal_tensorflow(image: str) -> None:
-    outputs = np.load(TENSORFLOW / "reference.npz")
-    net = aslfeat_from(converted(), "aslfeat").double()
-    gray = torch.from_numpy(outputs[f"{image}/image"]).double()
-    with torch.inference_mode():
-        maps = net(gray[None, None])[0]
-    scores = torch.from_numpy(outputs[f"{image}/score_map"]).double()
-    features = torch.from_numpy(outputs[f"{image}/features"]).double().permute(2, 0, 1)
-    assert scores.std() > 0.1 and features.std() > 0.5
-    torch.testing.assert_close(maps.scores, scores, rtol=0, atol=1e-6)
-    torch.testing.assert_close(maps.features, features, rtol=0, atol=1e-5)
-
-
 def test_strips_give_the_same_peakiness(monkeypatch: pytest.MonkeyPatch) -> None:
     features = torch.randn(6, 20, 11, generator=torch.Generator().manual_seed(1))
     whole = peakiness(features, 3, torch.tensor(1.0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -74,24 +73,6 @@ def test_gray_is_luma_rounded_to_eight_bits() -> None:
     np.testing.assert_allclose(levels, levels.round(), atol=1e-4)
     luma = image.astype(np.float64) @ [0.299, 0.587, 0.114]
     assert np.abs(levels - luma).max() < 0.51  # cv2 counts in fixed point
-
-
-def test_a_second_checkpoint_replaces_the_descriptors(
-    superpoint_weights: Path, other_superpoint: dict[str, torch.Tensor], tmp_path: Path
-) -> None:
-    image = texture(64, 80, sigma_px=1.5)
-    tuned = tmp_path / "megadepth.pth"
-    torch.save({k: v for k, v in other_superpoint.items() if not k.startswith("convP")}, tuned)
-    plugin = extractor(superpoint_weights, descriptor_weights=str(tuned))
-    alone = extractor(superpoint_weights)
-    assert (alone.name, plugin.name) == ("superpoint", "superpoint-megadepth")
-    assert plugin.weights() == {
-        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in (superpoint_weights, tuned)
-    }
-    result, frozen = plugin.extract(image), alone.extract(image)
-    np.testing.assert_array_equal(result.keypoints_px, frozen.keypoints_px)
-    assert np.abs(result.descriptors - frozen.descriptors).max() > 0.1
 
 
 def test_the_batch_norm_variant_is_recognised_by_its_keys(

@@ -53,16 +53,6 @@ def about_x(angle_deg: float) -> np.ndarray:
     return np.array([np.cos(half), np.sin(half), 0.0, 0.0])
 
 
-@given(seeds)
-def test_angles_agree_with_scipy(seed: int) -> None:
-    first, _ = random_poses(seed)
-    second, _ = random_poses(seed + 1)
-    expected = (scipy_rotation(first) * scipy_rotation(second).inv()).magnitude()
-    np.testing.assert_allclose(
-        rotation_angles_deg(first, second), np.rad2deg(expected), rtol=0, atol=1e-9
-    )
-
-
 @given(st.floats(-12, 2.2), seeds)
 def test_small_and_large_angles_keep_their_digits(exponent: float, seed: int) -> None:
     angle_deg = 10.0**exponent

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -69,8 +68,6 @@ def test_the_distance_equals_the_networks(files: tuple[Path, Path]) -> None:
     assert expected > 0
     assert plugin.distance(a, b, valid) == pytest.approx(expected, rel=1e-5)
     assert plugin.distance(a, a, valid) == 0.0
-    again = pickle.loads(pickle.dumps(plugin))
-    assert again.distance(a, b, valid) == plugin.distance(a, b, valid)
     half = distance(files, half_precision=True).distance(a, b, FULL)
     assert half == pytest.approx(plugin.distance(a, b, FULL), rel=0.1)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scenes import Scene
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.localization.ranking import (
@@ -26,6 +26,7 @@ from megloc_kapture.values import Camera, RigidTransform
 CAMERA = Camera("SIMPLE_PINHOLE", 160, 120, (120.0, 80.0, 60.0))
 WALL_M = 3.0
 APART_M = 20.0  # between rooms
+RIGHT = 2
 
 
 def stripes(seed: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -57,49 +58,28 @@ def photograph(room: int, pose: RigidTransform) -> NDArray[np.uint8]:
     return image.reshape(CAMERA.height, CAMERA.width, 3)
 
 
-@dataclass
-class Scene:
-    """Rooms with two map images each; some images lack depth, or depth in some columns."""
+# two images of each room
+POSES = {
+    f"{room}_{number}.jpg": standing(room, x, -0.2)
+    for room in range(4)
+    for number, x in enumerate((-0.4, 0.5))
+}
 
-    query: NDArray[np.uint8]
-    without_depth: tuple[str, ...] = ()
-    unknown: dict[str, slice] = field(default_factory=dict)
-    mask: NDArray[np.bool_] | None = None
-    asked: list[str] = field(default_factory=list)
-    # position of a numbered image in front of the wall: to the side, and ahead
-    stands: Callable[[int], tuple[float, float]] = lambda number: ((-0.4, 0.5)[number], -0.2)
 
-    def place(self, name: str) -> tuple[int, RigidTransform]:
-        room, number = (int(part) for part in name.removesuffix(".jpg").split("_"))
-        return room, standing(room, *self.stands(number))
+def scene_of(poses: Mapping[str, RigidTransform]) -> Scene:
+    """Return a map with depth, whose names begin with the room, and a query "q"."""
+    images = {name: photograph(int(name[0]), pose) for name, pose in poses.items()}
+    images["q"] = photograph(RIGHT, standing(RIGHT))
+    shape = (CAMERA.height, CAMERA.width)
+    depths = {
+        name: DepthView(CAMERA, np.full(shape, WALL_M + 0.2, np.float32), RigidTransform.identity())
+        for name in poses
+    }
+    return Scene(dict(poses), dict.fromkeys(poses, CAMERA), depths, images)
 
-    def query_image(self, name: str) -> NDArray[np.uint8]:
-        self.asked.append(name)
-        return self.query
 
-    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
-        return self.mask
-
-    def map_image(self, name: str) -> NDArray[np.uint8]:
-        self.asked.append(name)
-        return photograph(*self.place(name))
-
-    def map_mask(self, name: str) -> None:
-        return None
-
-    def map_depth(self, name: str) -> DepthView | None:
-        if name in self.without_depth:
-            return None
-        depth = np.full((CAMERA.height, CAMERA.width), WALL_M + 0.2, np.float32)
-        if name in self.unknown:
-            depth[:, self.unknown[name]] = 0
-        return DepthView(CAMERA, depth, RigidTransform.identity())
-
-    def map_camera(self, name: str) -> Camera:
-        return CAMERA
-
-    def map_pose(self, name: str) -> RigidTransform:
-        return self.place(name)[1]
+def hide_depth(scene: Scene, name: str, columns: slice) -> None:
+    scene.depths[name].depth_m[:, columns] = 0
 
 
 def hypothesis(room: int, inliers: int, views: int = 1) -> PoseHypothesis:
@@ -117,13 +97,12 @@ def ranker(**options: object) -> PerceptualRanker:
     return PerceptualRanker(PerceptualRanker.Options.model_validate(options))
 
 
-RIGHT = 2
 HYPOTHESES = [hypothesis(0, 300), hypothesis(1, 280), hypothesis(RIGHT, 120), hypothesis(3, 200)]
 
 
 @pytest.fixture
 def scene() -> Scene:
-    return Scene(photograph(RIGHT, standing(RIGHT)))
+    return scene_of(POSES)
 
 
 def test_the_room_that_looks_like_the_query_wins(scene: Scene) -> None:
@@ -134,7 +113,7 @@ def test_the_room_that_looks_like_the_query_wins(scene: Scene) -> None:
     assert scores.shape == (4,) and np.isfinite(scores).all()
     assert np.argmax(scores) == 2
     assert scores[2] - np.delete(scores, 2).max() > 0.05
-    assert len(scene.asked) == len(set(scene.asked)) == 1 + 8  # every picture is read once
+    assert len(scene.asked) == len(set(scene.asked)) == 8  # every picture is read once
     again = pickle.loads(pickle.dumps(ranker()))
     np.testing.assert_array_equal(again.score(HYPOTHESES, scene), scores)
     # the views of a rig count together
@@ -163,13 +142,15 @@ def test_scores_follow_the_hypotheses(scene: Scene) -> None:
 def test_rooms_are_compared_on_their_common_pixels(scene: Scene) -> None:
     # only the part that all rooms share is known of a wrong room
     narrow = PoseHypothesis(("0_0.jpg",), HYPOTHESES[0].views, 4.0)
-    scene.unknown["0_0.jpg"] = slice(60, None)
+    hide_depth(scene, "0_0.jpg", slice(60, None))
     # the query has noise on a part that is known of the right room
-    noise = np.random.default_rng(0).normal(0, 12, scene.query.shape)
-    scene.query = (scene.query + noise).clip(0, 255).astype(np.uint8)
-    right = scene.query[:, 100:]
+    query = scene.images["q"]
+    noise = np.random.default_rng(0).normal(0, 12, query.shape)
+    query = (query + noise).clip(0, 255).astype(np.uint8)
+    right = query[:, 100:]
     more = np.random.default_rng(1).integers(0, 60, right.shape, dtype=np.uint8)
-    scene.query[:, 100:] = right // 2 + more
+    query[:, 100:] = right // 2 + more
+    scene.images["q"] = query
     pair = [narrow, hypothesis(RIGHT, 120)]
     alone = ranker(finalists=1).score(pair, scene)
     together = ranker().score(pair, scene)
@@ -180,7 +161,8 @@ def test_rooms_are_compared_on_their_common_pixels(scene: Scene) -> None:
 def test_rooms_without_common_pixels_compare_their_distances(scene: Scene) -> None:
     # the poster of the wrong room and the wall of the right one are known
     for room, unknown in ((0, slice(90)), (RIGHT, slice(70, None))):
-        scene.unknown |= {f"{room}_{number}.jpg": unknown for number in (0, 1)}
+        for number in (0, 1):
+            hide_depth(scene, f"{room}_{number}.jpg", unknown)
     for order in (1, -1):
         pair = [hypothesis(0, 300), hypothesis(RIGHT, 120)][::order]
         for hypotheses in (pair, [PoseHypothesis(h.images[:1], h.views, 4.0) for h in pair]):
@@ -195,27 +177,28 @@ def test_poses_without_depth_or_pixels(scene: Scene) -> None:
     assert np.argmin(scores) == 2  # 120 of 300
     assert not any(name.startswith("2_") for name in scene.asked)
     # hypotheses without depth come last
-    scene.without_depth = ("3_0.jpg", "3_1.jpg")
+    depths = scene.depths
+    scene.depths = {name: view for name, view in depths.items() if name[0] != "3"}
     scores = ranker().score(HYPOTHESES, scene)
     assert np.argmax(scores) == 2 and np.argmin(scores) == 3
     assert np.isfinite(scores).all()
     # inliers decide if the best by inliers has no depth, or the query is masked
     expected = DistinctiveInliers().score(HYPOTHESES, scene)
-    scene.without_depth = ("0_0.jpg", "0_1.jpg")
+    scene.depths = {name: view for name, view in depths.items() if name[0] != "0"}
     np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
-    scene.without_depth = ()
-    scene.mask = np.zeros((CAMERA.height, CAMERA.width), bool)
+    scene.depths = depths
+    scene.masks["q"] = np.zeros((CAMERA.height, CAMERA.width), bool)
     np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
 
 
 def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
     plain = ranker().score(HYPOTHESES, scene)
     # a person hides the right part of the view
-    scene.query = scene.query.copy()
-    scene.query[:, 125:] = 255 * (np.indices((CAMERA.height, 35)).sum(0) % 2)[..., None]
+    scene.images["q"] = scene.images["q"].copy()
+    scene.images["q"][:, 125:] = 255 * (np.indices((CAMERA.height, 35)).sum(0) % 2)[..., None]
     spoilt = ranker().score(HYPOTHESES, scene)
-    scene.mask = np.ones((CAMERA.height, CAMERA.width), bool)
-    scene.mask[:, 125:] = False
+    scene.masks["q"] = np.ones((CAMERA.height, CAMERA.width), bool)
+    scene.masks["q"][:, 125:] = False
     masked = ranker().score(HYPOTHESES, scene)
     assert np.argmax(masked) == 2
     assert masked[2] - masked[0] > spoilt[2] - spoilt[0]
@@ -225,12 +208,12 @@ def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
 def test_an_aligned_view_equals_the_query(scene: Scene) -> None:
     view = aligned_view(CAMERA, standing(RIGHT), ["2_0.jpg", "2_1.jpg"], scene)
     assert view.valid.mean() > 0.95
-    difference = np.abs(view.image.astype(int) - scene.query)[view.valid]
+    difference = np.abs(view.image.astype(int) - scene.images["q"])[view.valid]
     assert difference.mean() < 3
     half = PerceptualOptions(long_side=80)
     small = aligned_view(CAMERA, standing(RIGHT), ["2_0.jpg"], scene, half)
     assert small.image.shape == (60, 80, 3)
-    reduced = query_at_size(scene.query, 80, 60)
+    reduced = query_at_size(scene.images["q"], 80, 60)
     assert np.abs(small.image.astype(int) - reduced)[small.valid].mean() < 4
 
 
@@ -239,7 +222,8 @@ def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
     near = standing(RIGHT, 0.45)
     aligned_view(CAMERA, near, ["2_0.jpg", "2_1.jpg"], scene, one)
     assert scene.asked == ["2_1.jpg"]
-    scene.without_depth, scene.asked = ("2_1.jpg",), []
+    scene.asked = []
+    del scene.depths["2_1.jpg"]
     aligned_view(CAMERA, near, ["2_0.jpg", "2_1.jpg"], scene, one)
     assert scene.asked == ["2_0.jpg"]
     assert not aligned_view(CAMERA, near, [], scene).valid.any()
@@ -247,10 +231,8 @@ def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
 
 def test_references_from_different_positions_come_first() -> None:
     # four images from nearly the same position, and another
-    room = Scene(
-        photograph(RIGHT, standing(RIGHT)),
-        stands=lambda number: (0.9 if number == 9 else -0.5 + 0.001 * number, 0.5),
-    )
+    numbers = {0: -0.5, 1: -0.499, 2: -0.498, 3: -0.497, 9: 0.9}
+    room = scene_of({f"2_{number}.jpg": standing(RIGHT, x, 0.5) for number, x in numbers.items()})
     film = [f"2_{number}.jpg" for number in range(4)]
     two = PerceptualOptions(references=2)
     view = aligned_view(CAMERA, standing(RIGHT), [*film, "2_9.jpg"], room, two)

@@ -80,38 +80,6 @@ def noisy_view(
     return View(camera, AT_ORIGIN, pixels, world)
 
 
-@pytest.mark.usefixtures("whole_covariance")
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
-def test_the_covariance_of_a_rig_agrees_with_finite_differences(model: str) -> None:
-    """Points have no covariances; the scale comes from the residuals."""
-    rng = np.random.default_rng(0)
-    truth = random_pose(rng)
-    views = []
-    for camera in (CAMERAS[model], PINHOLE):
-        cam_from_rig = perturbed(AT_ORIGIN, np.append(rng.normal(size=3), 0.3 * rng.normal(size=3)))
-        seen = noisy_view(camera, cam_from_rig @ truth, rng, 20)
-        views.append(replace(seen, cam_from_rig=cam_from_rig))
-    all_matches = np.ones(40, np.bool_)
-    estimate = PoseEstimate(truth, all_matches, all_matches, np.zeros(40))
-    pose = located(refine_pose(PoseProblem.of(views), estimate, LOOSE))
-
-    def residuals(vector: Array) -> Array:
-        rig_from_world = perturbed(pose.cam_from_world, vector)
-        return np.concatenate(
-            [
-                project(v.camera, v.cam_from_rig @ rig_from_world, v.points_world) - v.points_px
-                for v in views
-            ]
-        ).ravel()
-
-    steps = 1e-6 * np.eye(6)
-    columns = np.array([residuals(s) - residuals(-s) for s in steps]) / 2e-6
-    inverse = np.linalg.inv(columns @ columns.T)
-    ratio = pose.covariance / inverse
-    np.testing.assert_allclose(ratio, np.full((6, 6), ratio[0, 0]), rtol=1e-3)
-    assert 0.5 < ratio[0, 0] < 2.0  # the noise is of one pixel
-
-
 def refined_by_poselib(view: View, start: RigidTransform) -> RigidTransform:
     """Refine twice by poselib with our rule for the scale, on undistorted pixels."""
     focal = focal_px(view.camera)
@@ -137,7 +105,7 @@ def refined_by_poselib(view: View, start: RigidTransform) -> RigidTransform:
 def test_without_covariances_the_pose_equals_poselibs(sigma_px: float) -> None:
     rng = np.random.default_rng(1)
     square = replace(PINHOLE, params=(F, F, CX, CY))
-    for _ in range(8):
+    for _ in range(4):
         truth = random_pose(rng)
         view = noisy_view(square, truth, rng, 100, sigma_px)
         view.points_px[:10] += 8.0 * rng.normal(size=(10, 2))
@@ -166,15 +134,14 @@ def test_refinement_converges_under_any_model(model: str, seed: int, unit: float
 
 
 @pytest.mark.usefixtures("whole_covariance")
-@pytest.mark.parametrize(("size", "sigma_px"), [(1e-9, 0.4), (0.02, 2.0)])
-def test_the_covariance_predicts_the_spread_of_estimates(size: float, sigma_px: float) -> None:
+def test_the_covariance_predicts_the_spread_of_estimates() -> None:
     """Errors over their covariance follow chi-squared with six degrees of freedom."""
     rng = np.random.default_rng(2)
-    truth = random_pose(rng)
+    truth, sigma_px = random_pose(rng), 2.0
     drawn = []
     for _ in range(200):
         view = noisy_view(PINHOLE, truth, rng, 80, sigma_px)
-        matrices = random_covariances(rng, 80, size)
+        matrices = random_covariances(rng, 80, 0.02)
         drawn_m = sigma_px * rng.normal(size=(80, 3))
         world = view.points_world + np.einsum("nij,nj->ni", np.linalg.cholesky(matrices), drawn_m)
         weighted_view = replace(view, points_world=world, point_covariances=six(matrices))

@@ -8,12 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from corner import CAMERA, render
 from numpy.typing import NDArray
+from scenes import Scene
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.structure import StructureDistance, _displacements_px
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
 
 Image = NDArray[np.uint8]
 FULL = np.ones((60, 80), bool)
@@ -83,49 +83,14 @@ def test_the_distance_without_valid_pixels_is_infinite() -> None:
     assert structure().distance(a, b, single) == np.inf
 
 
-SMALL = Camera.pinhole(320, 240, 300.0)
-DEPTH_M = 4.0
+DEPTH_M = 6.0  # of the wall that the cameras face
 
 
-def texture() -> NDArray[np.uint8]:
-    rng = np.random.default_rng(3)
-    noise = rng.normal(size=(1200, 1200)).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 4)
-    return np.uint8(np.clip(128 + 40 * smooth / smooth.std(), 0, 255))
-
-
-PLANE = texture()
-
-
-def view(pose: RigidTransform, camera: Camera = SMALL) -> NDArray[np.uint8]:
-    """Render the plane at z = 4 m, whose pixels are 1 / 75 m."""
-    corners = np.float32([[0, 0], [1200, 0], [1200, 1200], [0, 1200]])
-    world = np.column_stack([(corners - 600) / 75, np.full(4, DEPTH_M)])
-    px = project(camera, pose, world.astype(np.float64)).astype(np.float32)
-    homography = cv2.getPerspectiveTransform(corners - 0.5, px - 0.5)
-    seen = cv2.warpPerspective(PLANE, homography, (camera.width, camera.height))
-    return np.repeat(seen[..., None], 3, axis=2)
-
-
-class Scene:
-    """A query and map images, as arrays."""
-
-    def __init__(self, query: NDArray[np.uint8], poses: dict[str, RigidTransform]) -> None:
-        self.query, self.poses = query, poses
-
-    def query_image(self, name: str) -> NDArray[np.uint8]:
-        return self.query
-
-    def map_image(self, name: str) -> NDArray[np.uint8]:
-        if name not in self.poses:
-            raise DataError(f"no pixels of {name}")
-        return view(self.poses[name])
-
-    def map_camera(self, name: str) -> Camera:
-        return SMALL
-
-    def map_pose(self, name: str) -> RigidTransform:
-        return self.poses.get(name, RigidTransform.identity())
+def scene_of(query: Image, **poses: RigidTransform) -> Scene:
+    """Return a scene with a query "q" and rendered map images; the image "lost" has no pixels."""
+    poses["lost"] = RigidTransform.identity()
+    rendered = {name: render(pose) for name, pose in poses.items() if name != "lost"}
+    return Scene(poses, dict.fromkeys(poses, CAMERA), images={"q": query, **rendered})
 
 
 def moved(
@@ -136,7 +101,7 @@ def moved(
 
 
 def on_plane(count: int = 200) -> NDArray[np.float64]:
-    xy = np.random.default_rng(1).uniform(-1.0, 1.0, (count, 2))
+    xy = np.random.default_rng(1).uniform(-1.5, 1.5, (count, 2))
     return np.column_stack([xy, np.full(count, DEPTH_M)])
 
 
@@ -145,11 +110,11 @@ def on_plane(count: int = 200) -> NDArray[np.float64]:
 )
 def test_the_true_pose_displaces_no_points(true_pose: RigidTransform) -> None:
     # brighter, noisier and of less contrast, like another time of the day
-    noise = np.random.default_rng(0).normal(0, 4, (240, 320, 1))
-    query = np.uint8(np.clip(90 + 0.4 * view(true_pose).astype(float) + noise, 0, 255))
-    scene = Scene(query, {"a": moved(), "b": moved(-0.2)})
+    noise = np.random.default_rng(0).normal(0, 4, (300, 400, 1))
+    query = np.uint8(np.clip(90 + 0.4 * render(true_pose).astype(float) + noise, 0, 255))
+    scene = scene_of(query, a=moved(), b=moved(-0.2))
     points = on_plane()
-    result = _displacements_px("q", SMALL, true_pose, points, ["a", "b"] * 100, scene)
+    result = _displacements_px("q", CAMERA, true_pose, points, ["a", "b"] * 100, scene)
     assert len(result) > 150
     assert np.median(result) < 0.35
 
@@ -157,18 +122,18 @@ def test_the_true_pose_displaces_no_points(true_pose: RigidTransform) -> None:
 @pytest.mark.parametrize("shift_px", [(1.5, 0.0), (3.0, -4.0)])
 def test_a_wrong_pose_displaces_points_by_its_error(shift_px: tuple[float, float]) -> None:
     metres = [px * DEPTH_M / 300 for px in shift_px]
-    scene = Scene(view(moved(*metres)), {"a": moved()})
-    result = _displacements_px("q", SMALL, moved(), on_plane(), ["a"] * 200, scene)
+    scene = scene_of(render(moved(*metres)), a=moved())
+    result = _displacements_px("q", CAMERA, moved(), on_plane(), ["a"] * 200, scene)
     assert len(result) > 150
     assert np.median(result) == pytest.approx(math.hypot(*shift_px), abs=0.15)
 
 
 def test_no_displacements_without_pixels_or_points() -> None:
-    image = view(moved())
+    image = render(moved())
 
     def result(query: Image, points: NDArray[np.float64], shown_by: str = "a") -> Any:
-        scene = Scene(query, {"a": moved()})
-        return _displacements_px("q", SMALL, moved(), points, [shown_by] * len(points), scene)
+        scene = scene_of(query, a=moved())
+        return _displacements_px("q", CAMERA, moved(), points, [shown_by] * len(points), scene)
 
     assert np.median(result(image[::-1, ::-1].copy(), on_plane())) > 2
     flat = np.full_like(image, 90)

@@ -26,7 +26,6 @@ Floats = NDArray[np.float64]
 
 MODELS = {
     "PINHOLE": (500.0, 510.0, 320.0, 240.0),
-    "RADIAL": (500.0, 320.0, 240.0, -0.12, 0.04),
     "OPENCV": (500.0, 510.0, 320.0, 240.0, -0.1, 0.03, 0.002, -0.003),
     "OPENCV_FISHEYE": (400.0, 410.0, 320.0, 240.0, -0.05, 0.01, 0.002, -0.001),
 }
@@ -90,7 +89,7 @@ def ceres(scene: pycolmap.Reconstruction, ids: list[int]) -> Floats:
 
 @pytest.mark.parametrize(
     ("model", "narrow"),
-    [("PINHOLE", True), ("RADIAL", False), ("OPENCV", True), ("OPENCV_FISHEYE", False)],
+    [("OPENCV", True), ("OPENCV_FISHEYE", False)],
 )
 def test_covariances_equal_ceres(model: str, narrow: bool) -> None:
     scene = synthetic(model, narrow=narrow)

@@ -71,8 +71,6 @@ def test_no_variant_is_larger_than_the_bound(side: int, expected: list[float]) -
     [
         ("scales", [(), (0.0,), (-1.0,), (float("nan"),), (100.0,)]),
         ("rotations_deg", [(45,), ()]),
-        ("mode", ["some"]),
-        ("min_matches", [0]),
     ],
 )
 def test_wrong_options_are_refused(name: str, values: list[Any]) -> None:
@@ -102,20 +100,6 @@ LIKE = ImageFeatures(ITSELF.keypoints_px, ITSELF.descriptors, 320, 240)
 
 def extract(image: np.ndarray, mask: np.ndarray | None) -> LocalFeatures:
     return SIFT.extract(image, mask)
-
-
-@pytest.mark.parametrize("variant", ALL_VARIANTS[1::3], ids=str)
-def test_keypoints_of_a_variant_are_mapped_to_the_image(variant: ImageVariant) -> None:
-    (actual,), skipped = extract_variants(IMAGE, None, [variant], extract, like=LIKE)
-    assert not skipped
-    assert (actual.features.width, actual.features.height) == variant.size(320, 240)
-    inside = actual.features.keypoints_px / variant.size(320, 240)
-    assert (inside >= 0).all() and (inside <= 1).all()
-    distance = np.linalg.norm(actual.keypoints_px[None] - CENTERS[:, None], axis=2)
-    shift = actual.keypoints_px[distance.argmin(axis=1)] - CENTERS
-    # an error of half a pixel in the variant is at least 0.17 px in the original
-    assert (np.linalg.norm(shift, axis=1) < 0.5).mean() > 0.9
-    assert np.abs(np.median(shift, axis=0)).max() < 0.08
 
 
 def test_masked_pixels_have_no_keypoints_in_any_variant() -> None:
@@ -282,7 +266,7 @@ def test_variants_that_agree_with_the_richest_remain(rich: str) -> None:
 
 
 @pytest.mark.parametrize("rotation", (0, 90, 180, 270))
-@pytest.mark.parametrize("scale", (1 / 3, 0.7, 3.0))
+@pytest.mark.parametrize("scale", (1 / 3, 3.0))
 def test_pixels_are_mapped_to_their_positions_in_the_original(scale: float, rotation: int) -> None:
     # a pixel's value is its position in the original, which interpolation preserves
     width, height = 241, 161

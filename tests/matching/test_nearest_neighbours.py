@@ -91,24 +91,6 @@ def test_equal_to_loops_over_all_pairs(
         np.testing.assert_allclose(score, 1 - apart[0] / apart[1] if apart[1] else 0.0, atol=1e-5)
 
 
-@pytest.mark.parametrize(("max_ratio", "mutual"), [(0.6, True), (0.7, False), (0.9, True)])
-def test_the_ratio_is_of_distances(max_ratio: float, mutual: bool) -> None:
-    rng = np.random.default_rng(3)
-    options = NearestNeighbourOptions(max_ratio=max_ratio, mutual=mutual)
-    floats = rng.normal(size=(60, 6))
-    noisy = floats[rng.permutation(60)[:50]] + 0.4 * rng.normal(size=(50, 6))
-    # as COLMAP's SIFT: 512 times a unit vector, rounded
-    whole = np.abs(rng.normal(size=(60, 128)))
-    changed = whole[:50] + np.linspace(0.1, 1.5, 50)[:, None] * rng.normal(size=(50, 128))
-    for a, b, scale, dtype in ((noisy, floats, 1, float), (abs(changed), whole, 512, np.uint8)):
-        a, b = (scale * x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
-        a, b = (np.round(x).astype(dtype) if scale > 1 else x for x in (a, b))
-        matches = match_nearest(a, b, options)[0].tolist()
-        assert [tuple(match) for match in matches] == by_loops(a, b, options)
-        if max_ratio < 0.8:
-            assert 0 < len(matches) < 45  # the ratio has an effect
-
-
 def test_ties_go_to_the_smaller_index_and_empty_sets_have_no_matches() -> None:
     same = np.ones((3, 4), dtype=np.float32)
     assert match_nearest(same, same)[0].tolist() == [[0, 0]]

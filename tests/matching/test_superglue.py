@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, MeglocError
+from megloc_kapture.errors import DataError
 from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
@@ -128,22 +126,3 @@ def test_unusable_features_are_named(weights: Path) -> None:
     short = ImageFeatures(good.keypoints_px, good.descriptors[:, :32], 640, 480)
     with pytest.raises(DataError, match=r"small\.pth.*64 dimensions.*\(9, 32\)"):
         plugin.match(good, short)
-
-
-def test_a_pickled_plugin_gives_the_same_matches(weights: Path) -> None:
-    a = image(30, 0)
-    b = seen_again(a, 30, 1)
-    plugin = matcher(weights)
-    sent = pickle.dumps(plugin)
-    assert len(sent) < 5000  # no network
-    assert pickle.loads(sent).match(a, b)[1].tobytes() == plugin.match(a, b)[1].tobytes()
-    assert plugin.weights() == {"small.pth": hashlib.sha256(weights.read_bytes()).hexdigest()}
-
-
-def test_missing_and_mismatched_weights_are_named(tmp_path: Path) -> None:
-    with pytest.raises(MeglocError, match="nowhere"):
-        matcher(tmp_path / "nowhere.pth")
-    path = tmp_path / "wrong.pth"
-    torch.save({"bin_score": torch.tensor(1.0)}, path)
-    with pytest.raises(DataError, match=r"wrong\.pth: .*338 missing keys"):
-        matcher(path).match(image(3, 0), image(3, 1))

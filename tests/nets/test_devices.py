@@ -53,7 +53,11 @@ MATCHERS = {"superglue_outdoor": SuperGlue, "superpoint_lightglue": LightGlue}
 def keep_four_layers(path: Path) -> None:
     state = torch.load(path, weights_only=True)
     for key in list(state):
-        if key.startswith("gnn.layers.") and int(key.split(".")[2]) > 3:
+        layer = next((int(part) for part in key.split(".") if part.isdigit()), 0)
+        # the confidence of the last layer is not used
+        last = 2 if key.startswith("token_confidence.") else 3
+        of_layer = ("gnn.layers.", "transformers.", "log_assignment.", "token_confidence.")
+        if key.startswith(of_layer) and layer > last:
             del state[key]
     torch.save(state, path)
 
@@ -68,7 +72,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., 
             if name not in written:
                 sizes = Sizes(clusters=4, whitened=32, hidden=8)
                 paths = write_random_weights(folder / UNVERIFIED, sizes=sizes, names=[name])
-                if name == "superglue_outdoor":
+                if name in MATCHERS:
                     keep_four_layers(paths[name])
                 written.add(name)
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from kornia.feature.aliked.deform_conv2d import deform_conv2d as kornia_deform_conv2d
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
@@ -21,7 +19,6 @@ from megloc_kapture.nets.score_maps import (
     select_pixels,
     soft_argmax,
     suppress_non_maxima,
-    window_maximum,
 )
 
 Scores = NDArray[np.float32]
@@ -45,25 +42,7 @@ def by_definition(scores: Scores, radius: int, rounds: int) -> Scores:
     return np.where(kept, scores, 0)
 
 
-@given(
-    height=st.integers(1, 24),
-    width=st.integers(1, 24),
-    radius=st.integers(0, 9),
-    seed=st.integers(0, 99),
-)
-def test_window_maximum_equals_scipy(height: int, width: int, radius: int, seed: int) -> None:
-    values = random_scores(seed, (height, width))
-    expected = maximum_filter(values, size=2 * radius + 1, mode="constant", cval=-1)
-    result = window_maximum(torch.from_numpy(values), radius)
-    np.testing.assert_array_equal(result.numpy(), expected)
-    bits = values > 0.9
-    expected = maximum_filter(bits, size=2 * radius + 1, mode="constant", cval=False)
-    result = window_maximum(torch.from_numpy(bits), radius)
-    assert result.dtype == torch.bool
-    np.testing.assert_array_equal(result.numpy(), expected)
-
-
-@pytest.mark.parametrize(("radius", "rounds"), [(0, 2), (1, 0), (3, 1), (4, 2)])
+@pytest.mark.parametrize(("radius", "rounds"), [(0, 2), (1, 0), (4, 2), (70, 1)])
 def test_suppression_equals_its_definition(radius: int, rounds: int) -> None:
     scores = random_scores(radius, (47, 62))
     scores[10:14, 20:30] = 0.99  # equal neighbours

@@ -195,11 +195,6 @@ def test_half_precision_ends_before_the_transport(net: SuperGlueNet) -> None:
     assert agreeing > 0.95
 
 
-def random_scores(rows: int, columns: int, scale: float, seed: int = 0) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return scale * torch.randn((rows, columns), generator=generator)
-
-
 # scores beyond a thousand: an exponential alone over- and underflows
 @pytest.mark.parametrize(
     ("scale", "iterations", "bin_score"), [(0.1, 1, 2.3), (10.0, 2, -300.0), (300.0, 100, 300.0)]

@@ -70,7 +70,6 @@ def test_a_mask_applies_to_a_sensor_or_a_pattern_of_images() -> None:
     ("values", "message"),
     [
         ({}, "one of file, polygon and bottom_share"),
-        ({"bottom_share": 1.0}, "less than 1"),
         ({"polygon": [(0, 0), (1, 1)]}, "at least 3"),
         ({"polygon": [(0, 0), (1, 1), (0, 1.2)]}, "between 0 and 1"),
     ],

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +15,7 @@ from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from numpy.typing import NDArray
 from poses import displaced, pose_errors, rigid
 from pydantic import ValidationError
+from scenes import Scene
 
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement import icp
@@ -104,33 +104,30 @@ def sensed(
     return DepthView(DEPTH, depth.astype(np.float32), image_from_depth)
 
 
-@pytest.fixture(scope="module")
-def scene_of(new_scene: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a builder of a room, corridor or wall; the query is ``query.png``."""
-
-    def make(
-        name: str = "room",
-        *,
-        query_offset: RigidTransform = OFFSET,
-        map_offset: RigidTransform = IDENTITY,
-        seed: int | None = 0,
-    ) -> Any:
-        surfaces = surfaces_of(name)
-        views = {"query.png": sensed(surfaces, QUERY, query_offset, seed)}
-        for number, (image, pose) in enumerate(REFERENCES.items(), 1):
-            noise_seed = None if seed is None else seed + number
-            views[image] = sensed(surfaces, pose, map_offset, noise_seed)
-        return new_scene(dict(REFERENCES), dict.fromkeys(REFERENCES, COLOUR), views)
-
-    return make
+def scene_of(
+    name: str = "room",
+    *,
+    query_offset: RigidTransform = OFFSET,
+    map_offset: RigidTransform = IDENTITY,
+    seed: int | None = 0,
+) -> Scene:
+    """Return a room, corridor or wall; the query is ``query.png``."""
+    surfaces = surfaces_of(name)
+    views = {"query.png": sensed(surfaces, QUERY, query_offset, seed)}
+    for number, (image, pose) in enumerate(REFERENCES.items(), 1):
+        noise_seed = None if seed is None else seed + number
+        views[image] = sensed(surfaces, pose, map_offset, noise_seed)
+    return Scene(dict(REFERENCES), dict.fromkeys(REFERENCES, COLOUR), views)
 
 
 @pytest.fixture(scope="module")
-def furnished(scene_of: Callable[..., Any]) -> Any:
+def furnished() -> Scene:
     return scene_of()
 
 
-def refine(scene: Any, start: RigidTransform, options: IcpOptions | None = None) -> PoseRefinement:
+def refine(
+    scene: Scene, start: RigidTransform, options: IcpOptions | None = None
+) -> PoseRefinement:
     return Icp(options).refine("query.png", COLOUR, start, list(REFERENCES), scene)
 
 
@@ -145,9 +142,11 @@ def assert_accurate(
     assert off_m < distance_m and off_deg < angle_deg
 
 
-def test_a_pose_is_refined_despite_noise_and_holes(furnished: Any) -> None:
+def test_a_pose_is_refined_despite_noise_and_holes(furnished: Scene) -> None:
     start = displaced(QUERY, 1, 0.05, 3.0)
     assert pose_errors(start, QUERY) == pytest.approx((0.05, 3.0))
+    plugin = Icp()
+    assert isinstance(plugin, PoseRefiner) and plugin.name == "icp"
     result = refine(furnished, start)
     assert_accurate(result)
     measures = result.measures
@@ -159,16 +158,7 @@ def test_a_pose_is_refined_despite_noise_and_holes(furnished: Any) -> None:
     assert result.covariance is not None and result.covariance.shape == (6, 6)
 
 
-def test_a_start_far_off_is_kept(furnished: Any) -> None:
-    start = displaced(QUERY, 0, 1.0, 5.0)
-    result = refine(furnished, start)
-    assert not result.accepted and result.reason
-    assert result.cam_from_world == start and result.covariance is None
-
-
-def test_the_offset_between_depth_and_colour_counts(
-    furnished: Any, scene_of: Callable[..., Any]
-) -> None:
+def test_the_offset_between_depth_and_colour_counts(furnished: Scene) -> None:
     start = displaced(QUERY, 1, 0.03, 1.0)
     assert_accurate(refine(scene_of(query_offset=IDENTITY, map_offset=OFFSET), start))
     # the query's offset replaced by none
@@ -178,19 +168,14 @@ def test_the_offset_between_depth_and_colour_counts(
 
 
 @pytest.mark.parametrize(("name", "seed"), [("wall", None), ("corridor", 0)])
-def test_surfaces_that_slide_determine_no_pose(
-    scene_of: Callable[..., Any], name: str, seed: int | None
-) -> None:
+def test_surfaces_that_slide_determine_no_pose(name: str, seed: int | None) -> None:
     scene, start = scene_of(name, seed=seed), displaced(QUERY, 2, 0.03, 1.0)
     result = refine(scene, start)
     assert not result.accepted and "do not determine" in result.reason
-    assert result.cam_from_world == start
-    # the condition is the reason
-    unbound = IcpOptions(max_condition=1e15)
-    assert "do not determine" not in refine(scene, start, unbound).reason
+    assert result.cam_from_world == start and result.covariance is None
 
 
-def test_a_world_far_from_its_origin(furnished: Any) -> None:
+def test_a_world_far_from_its_origin(furnished: Scene) -> None:
     world = RigidTransform((1.0, 0.0, 0.0, 0.0), (-4.1e6, -1.2e6, -4.7e6))
     poses = {name: pose @ world for name, pose in furnished.poses.items()}
     result = refine(replace(furnished, poses=poses), displaced(QUERY, 0, 0.05, 3.0) @ world)
@@ -199,7 +184,7 @@ def test_a_world_far_from_its_origin(furnished: Any) -> None:
     assert distance_m < 0.005 and angle_deg < 0.2
 
 
-def test_movement_and_overlap_are_bounded(furnished: Any) -> None:
+def test_movement_and_overlap_are_bounded(furnished: Scene) -> None:
     start = displaced(QUERY, 0, 0.05, 3.0)
     assert "moved" in refine(furnished, start, IcpOptions(max_moved_m=0.04)).reason
     forced = refine(furnished, start, IcpOptions(max_moved_m=0.04, accept_always=True))
@@ -224,7 +209,7 @@ def test_the_overlap_may_fall_by_its_noise() -> None:
     assert "residual did not fall" in reason(0.974, 0.0041, 2000)
 
 
-def test_poses_without_depth_have_a_reason(furnished: Any) -> None:
+def test_poses_without_depth_have_a_reason(furnished: Scene) -> None:
     start, views = displaced(QUERY, 0, 0.05, 3.0), furnished.depths
     assert "no depth" in refine(replace(furnished, depths={}), start).reason
     empty = replace(views["query.png"], depth_m=np.zeros((180, 240), np.float32))
@@ -234,7 +219,7 @@ def test_poses_without_depth_have_a_reason(furnished: Any) -> None:
     assert "the map has only 0 points" in nothing_there.reason
 
 
-def test_masked_pixels_are_left_out(furnished: Any) -> None:
+def test_masked_pixels_are_left_out(furnished: Scene) -> None:
     """A person in front of the query's camera is not in the map."""
     view = furnished.depths["query.png"]
     depth = view.depth_m.copy()
@@ -251,7 +236,7 @@ def test_masked_pixels_are_left_out(furnished: Any) -> None:
     assert masked.measures["overlap_after"] > unmasked.measures["overlap_after"] + 0.05
 
 
-def test_dense_map_points_replace_depth(furnished: Any, scene_of: Callable[..., Any]) -> None:
+def test_dense_map_points_replace_depth(furnished: Scene) -> None:
     rows, columns = np.indices((180, 240)).reshape(2, -1) + 0.5
     rays = np.column_stack([(columns - 120) / 219, (rows - 90) / 219, np.ones(len(rows))])
     exact = scene_of(seed=None).depths
@@ -282,13 +267,6 @@ def test_arrays_of_a_corner_are_aligned() -> None:
     assert_accurate(refine_by_icp(query, corner, start), 2e-3, 0.05, truth)
 
 
-def test_a_pickled_plugin_keeps_its_options() -> None:
-    options = IcpOptions(max_references=3)
-    plugin = pickle.loads(pickle.dumps(Icp(options)))
-    assert isinstance(plugin, PoseRefiner)
-    assert (plugin.name, plugin.options) == ("icp", options)
-
-
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -297,8 +275,6 @@ def test_a_pickled_plugin_keeps_its_options() -> None:
         {"voxels_m": (), "max_distances_m": ()},
         {"max_distances_m": (0.3, 0.1, 0.0)},
         {"noise": (0.001, -0.01, 0.002)},
-        {"min_overlap": 1.5},
-        {"max_condition": 1.0},
     ],
 )
 def test_options_that_cannot_be_used(wrong: dict[str, object]) -> None:
@@ -315,17 +291,17 @@ def depth_of(depth_m: float) -> DepthView:
     return DepthView(WALL_CAMERA, np.full((48, 64), depth_m, np.float32), IDENTITY)
 
 
-def cloud_of(scene: Any, references: Sequence[str]) -> NDArray[np.float64]:
+def cloud_of(scene: Scene, references: Sequence[str]) -> NDArray[np.float64]:
     points = depth_cloud(WALL_QUERY)
     return map_cloud(WALL_QUERY, points, IDENTITY, references, scene, WALL_OPTIONS)
 
 
-def test_references_with_most_overlap_from_different_views(new_scene: Callable[..., Any]) -> None:
+def test_references_with_most_overlap_from_different_views() -> None:
     """Every image sees a wall at z = 2."""
     x = {"aside": 1.8, "near": 0.3, "same": 0.35, "left": -0.5, "away": 9.0}
     poses = {name: shifted(at) for name, at in x.items()}
     views = dict.fromkeys(poses, depth_of(2.0))
-    scene = new_scene(poses, dict.fromkeys(poses, WALL_CAMERA), views)
+    scene = Scene(poses, dict.fromkeys(poses, WALL_CAMERA), views)
     result = cloud_of(scene, list(poses))
     # near and left: a wall from -0.5 - 1.07 m to 0.3 + 1.07 m
     assert result[:, 0].min() == pytest.approx(-1.37, abs=0.06)
@@ -338,10 +314,10 @@ def test_references_with_most_overlap_from_different_views(new_scene: Callable[.
     assert cloud_of(behind, ["behind"]).shape == (0, 3)
 
 
-def test_map_points_are_used_if_no_reference_has_depth(new_scene: Callable[..., Any]) -> None:
+def test_map_points_are_used_if_no_reference_has_depth() -> None:
     points = np.random.default_rng(0).uniform(-5.0, 5.0, (5000, 3))
     poses = {"a": shifted(0.0), "b": shifted(1.0)}
-    scene = new_scene(poses, dict.fromkeys(poses, WALL_CAMERA), points=points)
+    scene = Scene(poses, dict.fromkeys(poses, WALL_CAMERA), points=points)
     result = cloud_of(scene, ["a", "b"])
     query = depth_cloud(WALL_QUERY)
     low, high = query.min(axis=0) - 0.3, query.max(axis=0) + 0.3

@@ -40,7 +40,7 @@ def corner(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray
     return points, np.eye(3)[walls]
 
 
-def corner_surface(seed: int, count: int = 60000) -> Surface:
+def corner_surface(seed: int, count: int = 20000) -> Surface:
     return surface_of(downsample(corner(np.random.default_rng(seed), count)[0], 0.05))
 
 
@@ -63,7 +63,7 @@ def test_thinned_points_are_means_of_voxels() -> None:
 
 
 def test_normals_are_the_least_varying_directions() -> None:
-    surface = corner_surface(1, 20000)
+    surface = corner_surface(1)
     points = surface.points
     _, rows = cKDTree(points).query(points, NORMAL_NEIGHBOURS)
     around = points[rows] - points[rows].mean(axis=1, keepdims=True)
@@ -123,7 +123,7 @@ def test_the_condition_of_a_cube() -> None:
 
 
 def test_the_fit_is_that_of_the_nearest_planes() -> None:
-    rng, surface = np.random.default_rng(1), corner_surface(1, 20000)
+    rng, surface = np.random.default_rng(1), corner_surface(1)
     points = rng.uniform(-0.2, 1.0, (400, 3))
     turn = Rotation.from_rotvec([0.1, 0.2, -0.1]).as_matrix()
     surface_from_points = RigidTransform.from_matrix(turn, np.array([0.05, 0.0, -0.05]))

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from poses import displaced, error_vector
+from camera_models import CAMERAS
+from numpy.typing import NDArray
+from poses import displaced, error_vector, random_pose
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.poses import perturbed
+from megloc_kapture.plugins import PoseRefinement
 from megloc_kapture.refinement.acceptance import (
+    Candidate,
+    RenderingOptions,
+    accept_or_keep,
     compare_poses,
     correlation,
     covariance,
@@ -29,11 +35,55 @@ from megloc_kapture.refinement.photometric import (
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
 
-Problems = Callable[..., tuple[LevelProblem, RigidTransform]]
+Array = NDArray[np.float64]
+WIDTH, HEIGHT = 160, 120
+
+
+def texture(rng: np.random.Generator, channels: int, deviation_px: float = 1.5) -> Array:
+    noise = rng.normal(size=(HEIGHT, WIDTH, channels))
+    smooth = cv2.GaussianBlur(noise, (0, 0), deviation_px).reshape(noise.shape)
+    return np.asarray(smooth / smooth.std())
+
+
+def bilinear(values: Array, x: Array, y: Array) -> Array:
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    a, b = (x - column)[:, None], (y - row)[:, None]
+    top = (1 - a) * values[row, column] + a * values[row, column + 1]
+    low = (1 - a) * values[row + 1, column] + a * values[row + 1, column + 1]
+    return np.asarray((1 - b) * top + b * low)
+
+
+def problem(
+    model: str = "PINHOLE",
+    *,
+    channels: int = 1,
+    count: int = 400,
+    noise: float = 0.0,
+    wrong: float = 0.0,
+    seed: int = 0,
+) -> tuple[LevelProblem, RigidTransform]:
+    """Return points with the query's values at the true pose, up to gain and bias."""
+    rng = np.random.default_rng(seed)
+    camera, pose = CAMERAS[model], random_pose(rng)
+    image = texture(rng, channels)
+    px = rng.uniform((20, 20), (camera.width - 20, camera.height - 20), (count, 2))
+    points = pose.inverse().apply(bearing_rays(camera, px) * rng.uniform(2.0, 9.0, (count, 1)))
+    scale = WIDTH / camera.width
+    # float32 like the level
+    values = bilinear(image.astype(np.float32).astype(float), *(scale * px.T - 0.5))
+    groups = rng.integers(0, 2, count)
+    values = np.array([0.7, 1.3])[groups, None] * values + np.array([0.2, -0.4])[groups, None]
+    outliers = rng.random(count) < wrong
+    values[outliers] += rng.normal(size=(outliers.sum(), channels)) * 3
+    # a level's noise is blurred like the level
+    query = (image + noise * texture(rng, channels, 0.8)).astype(np.float32)
+    level = Level(query, np.ones((HEIGHT, WIDTH), bool), scale, scale)
+    chosen = ChosenPoints(points, values, groups)
+    return LevelProblem(chosen, level, camera, pose), pose
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
-def test_derivatives_equal_differences(problem: Problems, model: str) -> None:
+def test_derivatives_equal_differences(model: str) -> None:
     aligned, truth = problem(model, channels=2)
     pose = displaced(truth, 3, 0.02, 0.3)
     gains, biases = np.array([[0.8, 1.1], [1.4, 0.9]]), np.array([[0.1, 0.0], [0.3, -0.2]])
@@ -65,7 +115,7 @@ def test_points_beyond_the_fold_of_a_lens_are_not_visible() -> None:
     np.testing.assert_array_equal(np.isnan(rows[:, 0, 0]), [True, False])
 
 
-def test_a_step_solves_the_whole_system(problem: Problems) -> None:
+def test_a_step_solves_the_whole_system() -> None:
     aligned, truth = problem(channels=2, wrong=0.1)
     at = aligned.nuisance_at(perturbed(truth, np.array([2e-3, -2e-3, 1e-3, 0.01, -0.01, 0.015])))
     rows = aligned.rows(at)
@@ -92,9 +142,7 @@ def test_a_step_solves_the_whole_system(problem: Problems) -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_pose_gains_and_biases_are_estimated_among_outliers(
-    problem: Problems, channels: int
-) -> None:
+def test_pose_gains_and_biases_are_estimated_among_outliers(channels: int) -> None:
     aligned, truth = problem("OPENCV", channels=channels, count=1500, wrong=0.3)
     start = perturbed(truth, np.array([1e-3, -1e-3, 1e-3, 0.006, -0.005, 0.006]))
     result = minimise(aligned, aligned.nuisance_at(start), last_step_px=1e-4)
@@ -103,7 +151,7 @@ def test_pose_gains_and_biases_are_estimated_among_outliers(
     np.testing.assert_allclose(result.biases, [[0.2] * channels, [-0.4] * channels], atol=1e-3)
 
 
-def test_occluded_points_are_left_out(problem: Problems) -> None:
+def test_occluded_points_are_left_out() -> None:
     aligned, truth = problem(count=6000, noise=0.2)
     other, _ = problem(count=1, seed=9)
     values = aligned.level.values.copy()
@@ -124,7 +172,7 @@ def test_occluded_points_are_left_out(problem: Problems) -> None:
 AWAY = np.array([0.06, -0.06, 0.01, 0.02, -0.01, 0.02])
 
 
-def test_costs_and_significance_equal_a_plain_loop(problem: Problems) -> None:
+def test_costs_and_significance_equal_a_plain_loop() -> None:
     aligned, truth = problem(count=3000, noise=0.3, wrong=0.1)
     old = perturbed(truth, AWAY)
     comparison = compare_poses(aligned, old, truth)
@@ -153,19 +201,7 @@ def test_costs_and_significance_equal_a_plain_loop(problem: Problems) -> None:
     assert expected > 4
 
 
-def test_a_pose_tuned_to_noise_is_not_significant(problem: Problems) -> None:
-    result = []
-    for seed in range(5):
-        aligned, truth = problem(count=3000, noise=0.3, seed=seed)
-        tuned = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
-        comparison = compare_poses(aligned, truth, tuned.cam_from_world)
-        assert comparison.after.cost < comparison.before.cost
-        result.append(comparison.significance)
-    # six parameters tuned to noise gain half of chi-squared / sqrt(chi-squared): about 1.2
-    assert 0.6 < np.mean(result) < 1.8
-
-
-def test_the_correlation_is_about_each_references_mean(problem: Problems) -> None:
+def test_the_correlation_is_about_each_references_mean() -> None:
     aligned, truth = problem(channels=1, count=500, noise=0.5)
     at = aligned.nuisance_at(truth)
     query, groups = aligned.rows(at)[:, 0, 7], aligned.chosen.groups
@@ -179,8 +215,8 @@ def test_the_correlation_is_about_each_references_mean(problem: Problems) -> Non
     assert 0.5 < expected < 0.99
 
 
-def test_the_covariance_predicts_the_errors(problem: Problems) -> None:
-    errors, claimed = [], []
+def test_the_covariance_predicts_errors_and_noise_is_not_significant() -> None:
+    errors, claimed, significance = [], [], []
     for seed in range(8):
         aligned, truth = problem(count=3000, noise=0.3, seed=seed)
         result = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
@@ -189,12 +225,40 @@ def test_the_covariance_predicts_the_errors(problem: Problems) -> None:
         vector = error_vector(result.cam_from_world, truth)
         errors.append(vector @ np.linalg.solve(claim, vector) / 6)
         claimed.append(np.sqrt(np.diagonal(claim)))
+        comparison = compare_poses(aligned, truth, result.cam_from_world)
+        assert comparison.after.cost < comparison.before.cost
+        significance.append(comparison.significance)
     # 1 for the true covariance; a few dozen cells estimate it roughly
     assert 0.6 < np.mean(errors) < 2.0
     assert np.min(claimed) > 0 and np.max(claimed) < 0.02
+    # six parameters tuned to noise gain half of chi-squared / sqrt(chi-squared): about 1.2
+    assert 0.6 < np.mean(significance) < 1.8
 
 
-def test_a_flat_query_determines_nothing(problem: Problems) -> None:
+def test_poses_beyond_a_bound_are_rejected() -> None:
+    aligned, truth = problem(count=3000, noise=0.3)
+    start = displaced(truth, 0)
+    candidate = Candidate(aligned, aligned, aligned.nuisance_at(truth))
+
+    def result(overlap: float = 0.9, **options: float) -> PoseRefinement:
+        chosen = RenderingOptions.model_validate(options)
+        return accept_or_keep(start, candidate, (0.9, overlap), chosen)
+
+    assert result().accepted and result().cam_from_world == truth
+    for options, reason in (
+        ({"max_translation_m": 0.05}, "would move"),
+        ({"max_rotation_deg": 1.0}, "would turn"),
+        ({"min_correlation": 0.99}, "correlation"),
+        ({"min_significance": 1000.0}, "standard errors"),
+    ):
+        refused = result(**options)
+        assert reason in refused.reason and refused.cam_from_world is start
+    # the overlap may fall by a tenth
+    assert result(overlap=0.82).accepted and "overlap falls" in result(overlap=0.8).reason
+    assert result(overlap=0.0, accept_always=True).accepted
+
+
+def test_a_flat_query_determines_nothing() -> None:
     aligned, truth = problem()
     flat = Level(np.ones_like(aligned.level.values), aligned.level.valid, 0.25, 0.25)
     empty = LevelProblem(aligned.chosen, flat, aligned.camera, truth)
@@ -202,7 +266,7 @@ def test_a_flat_query_determines_nothing(problem: Problems) -> None:
     assert perturbed_starts(empty, empty.nuisance_at(truth)) == []
 
 
-def test_whitened_steps_change_the_image_equally(problem: Problems) -> None:
+def test_whitened_steps_change_the_image_equally() -> None:
     aligned, truth = problem(noise=0.2)
     at = aligned.nuisance_at(truth)
     system = aligned.system_at(at, at.squared_scale)

@@ -34,14 +34,14 @@ def wall_texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
     return np.clip(128 + 30 * image, 0, 255).astype(np.uint8)
 
 
-def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
+def render(cam_from_world: RigidTransform, camera: Camera = CAMERA) -> NDArray[np.uint8]:
     """Render an image (H, W, 3), exact except for bilinear sampling."""
-    fx, fy, cx, cy = CAMERA.params
+    fx, fy, cx, cy = camera.params
     # OpenCV's warp has pixel centres at integers, in the texture and in the image
     calibration = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    size = (CAMERA.width, CAMERA.height)
-    image = np.full((CAMERA.height, CAMERA.width, 3), 128, dtype=np.uint8)
+    size = (camera.width, camera.height)
+    image = np.full((camera.height, camera.width, 3), 128, dtype=np.uint8)
     for seed, (origin, along, width, height) in enumerate(WALLS):
         texture = wall_texture(width * TEXTURE_PX_PER_M, height * TEXTURE_PX_PER_M, seed)
         world_from_texture = np.column_stack(
@@ -56,12 +56,12 @@ def render(cam_from_world: RigidTransform) -> NDArray[np.uint8]:
     return image
 
 
-def depth_m(cam_from_world: RigidTransform) -> NDArray[np.float32]:
+def depth_m(cam_from_world: RigidTransform, camera: Camera = CAMERA) -> NDArray[np.float32]:
     """Render the depth (H, W) along the optical axis in metres; 0 outside the walls."""
-    fx, fy, cx, cy = CAMERA.params
-    x = (np.arange(CAMERA.width) + 0.5 - cx) / fx
-    y = (np.arange(CAMERA.height) + 0.5 - cy) / fy
-    rays = np.stack([*np.meshgrid(x, y), np.ones((CAMERA.height, CAMERA.width))], axis=-1)
+    fx, fy, cx, cy = camera.params
+    x = (np.arange(camera.width) + 0.5 - cx) / fx
+    y = (np.arange(camera.height) + 0.5 - cy) / fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
     nearest = np.full(rays.shape[:2], np.inf)
     down = np.array([0.0, 1.0, 0.0])
     for origin, along, width, height in WALLS:

@@ -138,16 +138,16 @@ def test_seed_precision_and_initial_weights(
 ) -> None:
     data = [KaptureFolder(walk)]
     first = tmp_path / "first.safetensors"
-    whole = train(options(files, steps=2), first, kaptures=data)
-    in_half = options(files, steps=2, half_precision=True)
+    whole = train(options(files, steps=2, layers=2), first, kaptures=data)
+    in_half = options(files, steps=2, layers=2, half_precision=True)
     half = train(in_half, tmp_path / "half.safetensors", kaptures=data)
     assert whole["loss"] != half["loss"]
     assert whole["loss"] == pytest.approx(half["loss"], rel=0.05)
-    train(options(files, steps=2, seed=1), tmp_path / "second.safetensors", kaptures=data)
+    train(options(files, steps=2, layers=2, seed=1), tmp_path / "second.safetensors", kaptures=data)
     assert first.read_bytes() != (tmp_path / "second.safetensors").read_bytes()
     # on from there, with small steps, is near there
     third = tmp_path / "third.safetensors"
-    more = options(files, steps=2, matcher_weights=str(first), learning_rate=1e-7)
+    more = options(files, steps=1, layers=2, matcher_weights=str(first), learning_rate=1e-7)
     train(more, third, kaptures=data)
     for key, value in load_file(first).items():
         if value.ndim == 3:
@@ -225,13 +225,13 @@ def test_invalid_training_is_refused(
     assert not output.exists()
     train(chosen, output, **data)
     with pytest.raises(OutputError, match=r"x\.json: is from another training \(options\); -f"):
-        train(options(files, steps=4), output, **data)
+        train(options(files, steps=2), output, **data)
     output.with_suffix(".state.pt").write_bytes(b"PK damaged")
     with pytest.raises(
         DataError, match=r"x\.state\.pt: is damaged, or the state of another training"
     ):
         train(chosen, output, **data)
-    assert train(options(files, steps=4), output, **data, force=True)["step"] == 4
+    assert train(options(files, steps=2), output, **data, force=True)["step"] == 2
     mine = tmp_path / "mine.safetensors"
     mine.write_bytes(b"of somebody else")
     with pytest.raises(OutputError, match="not the output of a training"):
