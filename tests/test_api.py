@@ -212,7 +212,7 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
         megloc.open_map(built.kapture_map.folder.root, set={"localization.speed": 1}).localize(
             scene / "query"
         )
-    with pytest.raises(megloc.OptionError, match="come with no model"):
+    with pytest.raises(megloc.OptionError, match="needs a reference model"):
         by = {"mapping_pairs.by": ["covisibility"]}
         megloc.build_map(scene / "mapping", set=by, workspace=tmp_path / "refused")
     assert not (tmp_path / "refused").exists()

@@ -73,7 +73,9 @@ class Info(Reading, Common):
             for text in sizes:
                 line(console, "FAULT", text)
         else:
-            checked = "everything, image by image" if self.deep else "files: no fault found"
+            checked = (
+                "all files and images: no fault found" if self.deep else "files: no fault found"
+            )
             line(console, "checked", checked)
         if folder.has_points():
             self._describe_map(console, folder.root)
@@ -162,19 +164,20 @@ def describe_refinement(console: Console, folder: KaptureFolder) -> None:
 
 def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
     if extractor is None:
-        return f"must be given in kapture: no extractor for {local_type} is installed"
+        return f"must be in the query's kapture folder: no extractor for {local_type} is installed"
     try:
         load_plugin(LOCAL_FEATURES, extractor.name, extractor.options)
     except MeglocError as error:
-        return f"must be given in kapture; plugin {extractor.name} could extract them, but {error}"
-    return f"extracted by plugin {extractor.name}, or given in kapture"
+        absent = f"plugin {extractor.name} could extract them, but {error}"
+        return f"must be in the query's kapture folder; {absent}"
+    return f"extracted by plugin {extractor.name}, or read from the query's kapture folder"
 
 
 def describe_descriptors(
     opened: KaptureMap, keypoints: MapKeypoints, extractor: PluginChoice | None
 ) -> str:
     if keypoints.has_descriptors(opened.images):
-        return "there"
+        return "present"
     if extractor is None:
         return "missing, and no extractor for the type is installed: localization is not possible"
     if not opened.has_images():

@@ -188,7 +188,7 @@ class Render(Linked, Working):
         from megloc_kapture.stages.neural_field import render_along, views_between
 
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
-            raise OptionError("nothing to render: give --pose and --camera, --along or --between")
+            raise OptionError("give one of --pose (with --camera), --along and --between")
         many = self.along or self.between
         if many is None:
             self._render_one()

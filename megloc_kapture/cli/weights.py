@@ -105,10 +105,10 @@ class Fetch(Common):
         console.say(f"{weights.name}: {url}")
         console.say(f"  licence: {weights.licence}: {weights.terms}")
         fetch(url, place, sha256=file.sha256, track=console.track)
-        state = "sha256 right"
+        state = "sha256 correct"
         if file.sha256 is None:
             downloaded = describe(weights.name, place)
-            state = f"sha256 {sha256_of(downloaded)}, which the registry cannot check"
+            state = f"sha256 {sha256_of(downloaded)}; the registry has no sha256 to compare"
             if not file.convert:
                 try:
                     read_weights(downloaded)
@@ -164,7 +164,7 @@ class Check(Common):
         """Return 2 if a file is wrong."""
         wrong = sum(_wrong(console, lookup(name)) for name in self.names)
         if not self.names:
-            wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) == "there")
+            wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) == "present")
         console.result(f"wrong files: {wrong}" if wrong else "all files are correct")
         return WRONG_FILES if wrong else 0
 
@@ -193,7 +193,7 @@ class WeightsCommand:
 
 
 def summary() -> str:
-    present = [weights.name for weights in registry().values() if _state(weights) == "there"]
+    present = [weights.name for weights in registry().values() if _state(weights) == "present"]
     names = f": {', '.join(present)}" if present else ""
     return f"{len(present)} of {len(registry())} in {weights_folder()}{names}"
 
@@ -246,13 +246,13 @@ def _wrong(console: Console, weights: Weights) -> int:
 
 def _trust(file: WeightsFile) -> str:
     if file.published and file.published.sha256:
-        return "sha256 right"
+        return "sha256 correct"
     return f"loads; sha256 {sha256_of(file)} cannot be checked"
 
 
 def _state(weights: Weights) -> str:
     if next(files_of(weights), None):
-        return "there"
+        return "present"
     return "to convert" if to_convert(weights) else "missing"
 
 

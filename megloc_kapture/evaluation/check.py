@@ -317,7 +317,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
         if only_endings and dataset == _ANY_ENDING:
             severity, message = "warning", f"{message} (the server accepts either)"
         elif len(wrong) == len(lines):
-            message += "; the server finds none of them, and every figure is zero"
+            message += "; the server matches none of them, so every recall is zero"
         findings.append(Finding(severity, "name", message, names=tuple(wrong)))
     if not_scored:
         note = "of images that are not scored, which the server ignores"

@@ -247,7 +247,7 @@ def evaluate_without_truth(
     """
     labels = [result.label for result in results]
     if not results or len(set(labels)) != len(labels):
-        raise OptionError("results need different labels, and at least one is needed")
+        raise OptionError("at least one result is needed, and labels must differ")
     images = sorted({i for r in results for i in r.images} if queries is None else set(queries))
     require(images, "no query: the results name no image")
     conditions = benchmark.conditions(images)

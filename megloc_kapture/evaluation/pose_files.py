@@ -117,7 +117,7 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
             failed = not np.isfinite(values).all() or not any(values[:4])
             poses[name] = None if failed else parse_pose(fields[1:], "ltvl", repr(name))
     if failures := [name for name, pose in poses.items() if pose is None]:
-        message = "%s: rows of nan or zeros are queries without a pose: %d, the first is %s"
+        message = "%s: %d rows of nan or zeros are read as queries without a pose, such as %s"
         _log.warning(message, path, len(failures), failures[0])
     return {name: pose for name, pose in poses.items() if pose is not None}
 

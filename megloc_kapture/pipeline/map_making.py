@@ -117,7 +117,7 @@ def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
     options.retrieval()
     check_option(
         not options.pairs_by_points(),
-        "images with poses come with no model: mapping_pairs.by covisibility",
+        "mapping_pairs.by covisibility needs a reference model, which images with poses lack",
     )
     return [ImportMapping(mapping), *wanted_stages(MAP_STAGES, options)]
 

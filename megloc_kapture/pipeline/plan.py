@@ -362,7 +362,7 @@ def _check_root(stage: Stage, workspace: Workspace) -> None:
 
 
 def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
-    reasons = {first: "asked for"}
+    reasons = {first: "requested"}
     for stage in stages:
         if not reasons.keys().isdisjoint(_before(stages, stage)):
             reasons[stage.name] = f"follows {first}"

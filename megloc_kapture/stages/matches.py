@@ -348,7 +348,7 @@ def match_all(
         bounds = len(a.keypoints_px), len(other.keypoints_px)
         if ((matches < 0) | (matches >= bounds)).any():
             raise PluginError(
-                f"{who}: a match is outside the {bounds[0]} and {bounds[1]} keypoints"
+                f"{who}: a match has a keypoint index outside {bounds[0]} and {bounds[1]} keypoints"
             )
     return pairs
 

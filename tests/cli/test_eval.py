@@ -198,7 +198,7 @@ def test_failed_queries_are_misses_and_a_rejected_stranger_is_correct(
     assert failed["0007.jpg"].startswith("the image cannot be used: ")
     assert "200x100, its camera says 400x300" in failed["0007.jpg"]
     text = " ".join((run / "evaluation" / "recall.txt").read_text().split())
-    assert "1 query shows nothing of the map: 1 refused, 0 given a pose" in text
+    assert "1 query shows nothing of the map: 1 not localized, 0 localized wrongly" in text
     # the localized query has the same pose as without the failed ones
     expected = (finished / POSES).read_text().splitlines(keepends=True)
     assert (run / POSES).read_text() == "".join(r for r in expected if "0001" in r)

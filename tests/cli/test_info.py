@@ -34,10 +34,10 @@ def test_the_content_and_possible_uses_of_a_foreign_map_are_listed(
     assert listed["images"] == f"{images} ({images} PINHOLE), {images} with a pose"
     assert listed["points"] == str(len(KaptureFolder(place).points3d()))
     assert listed["pixel origin"].startswith(f"{origin}: ")
-    assert listed["map descriptors"] == "there"
+    assert listed["map descriptors"] == "present"
     # R2D2 has an extractor, but its weights are missing
     assert listed["query features"].startswith(
-        "must be given in kapture; plugin r2d2 could extract"
+        "must be in the query's kapture folder; plugin r2d2 could extract"
     )
     assert "megloc weights fetch r2d2_WASF_N16" in listed["query features"]
     # the few images are all matched; global features of queries need missing weights
@@ -53,10 +53,10 @@ def test_the_content_and_possible_uses_of_a_foreign_map_are_listed(
 
 def test_our_own_map_is_checked_completely_on_demand(megloc: Any, finished: Path) -> None:
     listed = described(megloc("info", finished / "map", "--deep").out)
-    assert listed["checked"] == "everything, image by image"
+    assert listed["checked"] == "all files and images: no fault found"
     assert listed["pixel origin"].startswith("corner: ")
     assert listed["query features"].startswith("extracted by plugin rootsift")
-    assert listed["map descriptors"] == "there"
+    assert listed["map descriptors"] == "present"
 
 
 def test_a_folder_of_queries_is_no_map_and_may_have_unknown_cameras(

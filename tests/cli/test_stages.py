@@ -120,7 +120,7 @@ def test_reranked_pairs_and_their_matches_are_written(
     counts = {(count.image, count.other) for count in read_match_counts(matches, "rootsift")}
     assert counts == {(pair.query, pair.map) for pair in read_pairs(made.query_pairs)}
     assert len(read_pairs(pairs)) == 2 * 4
-    megloc(*command, "-f").refused("--rerank N and --matches-dir DIR go together")
+    megloc(*command, "-f").refused("--rerank N needs --matches-dir DIR")
     megloc(*command, "--matches-dir", matches).refused(r"reranked\.txt exists; -f")
 
 

@@ -85,9 +85,9 @@ def test_fetch_downloads_and_checks_files(megloc: Any, folder: Path) -> None:
     done = megloc("weights", "fetch", "free", "unknown")
     assert done.status == 0
     free, unknown = done.out.splitlines()
-    assert free == f"free: {folder}/free.pth ({len(FREE)} bytes, sha256 right)"
+    assert free == f"free: {folder}/free.pth ({len(FREE)} bytes, sha256 correct)"
     assert unknown.endswith(
-        f"sha256 {hashlib.sha256(UNKNOWN).hexdigest()}, which the registry cannot check)"
+        f"sha256 {hashlib.sha256(UNKNOWN).hexdigest()}; the registry has no sha256 to compare)"
     )
     assert "licence: SHORT: for looking at only" in done.err
     assert (folder / "free.pth").read_bytes() == FREE
@@ -164,7 +164,7 @@ def test_files_are_listed_and_damaged_and_missing_ones_named(megloc: Any, folder
     (folder / "free.pth").write_bytes(FREE)
     rows = [line.split() for line in megloc("weights", "list").out.splitlines()]
     states = {row[0]: row[-2:] for row in rows[1:5]}
-    assert states["free"] == ["there", "known"] and states["bound"] == ["missing", "known"]
+    assert states["free"] == ["present", "known"] and states["bound"] == ["missing", "known"]
     assert megloc("weights", "check").out.endswith("all files are correct\n")
     (folder / "free.pth").write_bytes(FREE[:-1])
     done = megloc("weights", "check")

@@ -49,8 +49,12 @@ def without(layouts: Path, dataset: str, tmp_path: Path, *gone: str) -> Path:
         ("robotcar", ["images", "3D-models"], "not RobotCar Seasons, no folder images and 3D"),
         ("4seasons", [DAY, SNOW], "no recording here"),
         ("inloc", [f"{CUTOUTS}/DUC1", f"{CUTOUTS}/DUC2"], "none of DUC1, DUC2 exists"),
-        ("inloc", ["query"], "query/iphone7/ is missing; InLoc lies as database"),
-        ("inloc", ["database/alignments"], "database/alignments/ is missing; InLoc lies as"),
+        ("inloc", ["query"], "query/iphone7/ is missing; the layout of InLoc is database"),
+        (
+            "inloc",
+            ["database/alignments"],
+            "database/alignments/ is missing; the layout of InLoc is",
+        ),
     ],
 )
 def test_a_folder_without_the_layout_is_refused(

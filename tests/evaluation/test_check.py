@@ -183,7 +183,7 @@ def named(
         (
             lambda name: name.removeprefix("rear/"),
             ROBOTCAR,
-            "100.jpg should be rear/100.jpg; the server finds none of them, and every figure is",
+            "100.jpg should be rear/100.jpg; the server matches none of them, so every recall is",
         ),
         (lambda name: AACHEN[name], AACHEN, "query/day/IMG_0.jpg should be IMG_0.jpg"),
         (lambda name: f"./{name}", AACHEN, "./IMG_0.jpg should be IMG_0.jpg"),

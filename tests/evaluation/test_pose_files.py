@@ -101,7 +101,7 @@ def test_rows_without_a_pose_are_misses(tmp_path: Path, caplog: pytest.LogCaptur
     path = tmp_path / "poses.txt"
     path.write_text(f"{GOOD}b.jpg nan nan nan nan nan nan nan\nc.jpg 0 0 0 0 0 0 0\n")
     assert list(read_pose_file(path)) == ["a.jpg"]
-    assert "rows of nan or zeros are queries without a pose: 2, the first is b.jpg" in caplog.text
+    assert "2 rows of nan or zeros are read as queries without a pose, such as b.jpg" in caplog.text
 
 
 @pytest.mark.parametrize(

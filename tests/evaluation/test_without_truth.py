@@ -121,7 +121,7 @@ def test_empty_or_equal_labels_are_refused(first: Result) -> None:
     with pytest.raises(DataError, match="no query"):
         evaluate_without_truth([Result("x", {}, ())])
     for results in ([first, first], []):
-        with pytest.raises(OptionError, match="different labels"):
+        with pytest.raises(OptionError, match="labels must differ"):
             evaluate_without_truth(results)
 
 

@@ -235,9 +235,9 @@ def test_first_and_last_stage(plan: Plan) -> None:
     assert [r.name for r in plan.run(last="a")] == ["a"]
     reports = plan.run(first="b")
     assert [(r.name, r.state) for r in reports] == [("a", "skipped"), ("b", "run"), ("c", "run")]
-    assert [r.why for r in reports] == ["", "asked for", "follows b"]
+    assert [r.why for r in reports] == ["", "requested", "follows b"]
     reports = plan.run(first="b", last="b")
-    assert [(r.state, r.why) for r in reports] == [("skipped", ""), ("run", "asked for")]
+    assert [(r.state, r.why) for r in reports] == [("skipped", ""), ("run", "requested")]
     assert [r.why for r in plan.run()] == ["", "", "not done yet"]
     with pytest.raises(OptionError, match="--until a comes before --from c"):
         plan.run(first="c", last="a")

@@ -99,7 +99,7 @@ def test_the_best_pairs_are_those_with_most_verified_matches() -> None:
     ("scores", "message"),
     [
         (np.ones(3), r"got float64 \(3,\), expected .*\(1\)"),
-        (np.ones(1), "outside the 3 and 5 keypoints"),
+        (np.ones(1), "outside 3 and 5 keypoints"),
     ],
 )
 def test_wrong_matches_of_a_plugin_are_refused(scores: Any, message: str) -> None:

@@ -255,7 +255,7 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
                 source = owner
             if source is None:
                 raise DataError(
-                    "the file's name does not say whose map it means; move the file into the "
+                    "the file name lacks the reference recording; move the file into the "
                     "folder of the reference recording",
                     path=path,
                 )

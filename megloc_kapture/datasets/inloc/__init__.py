@@ -135,9 +135,9 @@ class Layout:
                 continue
             if alignments is None or query is None:
                 absent = (_ALIGNMENTS if alignments is None else _QUERIES)[0]
-                raise DataError(f"{absent}/ is missing; InLoc lies as {LAYOUT}", path=root)
+                raise DataError(f"{absent}/ is missing; the layout of InLoc is {LAYOUT}", path=root)
             return cls(cutouts, alignments, query)
-        raise DataError(f"{_CUTOUTS[0]}/ is missing; InLoc lies as {LAYOUT}", path=root)
+        raise DataError(f"{_CUTOUTS[0]}/ is missing; the layout of InLoc is {LAYOUT}", path=root)
 
     def alignment(self, floor: str) -> Path:
         return self.alignments / floor

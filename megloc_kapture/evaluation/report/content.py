@@ -138,8 +138,8 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
     if confidence.num_nowhere:
         sentences.append(
             f"{counted(confidence.num_nowhere, 'query shows', 'queries show')} nothing of the map: "
-            f"{confidence.num_nowhere_refused} refused, "
-            f"{confidence.num_nowhere - confidence.num_nowhere_refused} given a pose"
+            f"{confidence.num_nowhere_refused} not localized, "
+            f"{confidence.num_nowhere - confidence.num_nowhere_refused} localized wrongly"
         )
     return sentences
 

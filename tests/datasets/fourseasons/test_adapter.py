@@ -283,7 +283,7 @@ def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
     assert missing_of(read(root)) == [root / "garage"]
     assert not missing_of(read(root, queries=SNOW))
     write(root / "relocalizationFile_garage.txt", f"{A} 1\n")
-    with pytest.raises(DataError, match="does not say whose map it means"):
+    with pytest.raises(DataError, match="lacks the reference recording"):
         read(root)
 
 
