@@ -71,7 +71,7 @@ def test_keypoints_have_scales_of_levels_and_pass_both_thresholds(
 
 
 def test_sizes_without_a_level_between_them_are_refused() -> None:
-    with pytest.raises(ValidationError, match=r"max_size is at least 1\.2 times min_size"):
+    with pytest.raises(ValidationError, match=r"max_size must be at least 1\.2 times min_size"):
         R2D2Options(min_size=1000, max_size=1024)
 
 
