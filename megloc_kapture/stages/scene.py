@@ -295,6 +295,10 @@ class _Images:
     def __init__(self, folder: KaptureFolder) -> None:
         self.folder = folder
 
+    @cached_property
+    def poses(self) -> dict[str, RigidTransform]:
+        return self.folder.read().poses()
+
     def camera(self, name: str) -> Camera:
         return self.folder.read().camera_of(name)
 
@@ -365,4 +369,4 @@ class KaptureScene:
         self.map_camera = map_camera or self._map.camera
 
     def map_pose(self, name: str) -> RigidTransform:
-        return self._map.folder.read().poses()[name]
+        return self._map.poses[name]
