@@ -1,4 +1,4 @@
-"""A dataset's sparse model as a kapture map, as hloc and others use it, and COLMAP databases.
+"""A dataset's sparse model, in which hloc and others localize, as a kapture map; COLMAP databases.
 
 pycolmap opens databases for writing: it adds tables to the user's file and fails in read-only
 folders. Here databases are opened as ``immutable``, which creates no files even in WAL mode.

@@ -139,7 +139,8 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
 def mcnemar(only_first: int, only_second: int) -> float:
     """Return the two-sided p-value of the exact McNemar test.
 
-    Null hypothesis: a query localized by only one method is equally likely localized by either.
+    Null hypothesis: a query that only one method localizes is equally likely to be localized by
+    either.
     """
     from scipy.special import bdtr
 
@@ -240,7 +241,7 @@ def evaluate_without_truth(
     queries: Collection[str] | None = None,
     thresholds: Sequence[Threshold] | None = None,
 ) -> WithoutTruth:
-    """Count localized queries, and compare the results with each other; poses are in one frame.
+    """Count localized queries, and compare the results. All poses must be in one coordinate frame.
 
     By default, ``queries`` are all images of the results. ``thresholds`` apply to the pose
     differences of two results.

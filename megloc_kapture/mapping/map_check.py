@@ -193,7 +193,7 @@ def camera_fault(camera: Camera) -> str | None:
     ratios = lengths[straight > 0.02] / straight[straight > 0.02]
     if len(ratios) and not (ratios.min() > 0.5 and ratios.max() < 3.0):
         farthest = max(ratios.tolist(), key=lambda ratio: abs(math.log(max(ratio, 1e-6))))
-        return f"its distortion moves pixels by a factor of {farthest:.2g}"
+        return f"undistorting multiplies the distance from the principal point by {farthest:.2g}"
     return None
 
 
@@ -227,7 +227,7 @@ def _readings(
     factors = _factors(images, xyz)
     if (scale := factors.get("keypoints")) is not None:
         yield (
-            f"keypoints of images {scale:.3g} times as large",
+            f"keypoints multiplied by {scale:.3g}",
             lambda image: replace(
                 image, keypoints_px=image.keypoints_px.astype(np.float64) * scale
             ),

@@ -157,7 +157,7 @@ def export_tum(scene: Scene, output: Path) -> None:
     stamps = [stamp for stamp, _ in rows]
     if len(set(stamps)) != len(stamps):
         raise DataError(
-            "several images have one timestamp; choose one camera with --sensor: "
+            "several images share a timestamp; choose one camera with --sensor: "
             f"{', '.join(sorted({image.sensor for image in scene.images}))}"
         )
     exponent = _exponent_of_seconds(max(stamps))

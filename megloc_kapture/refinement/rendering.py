@@ -49,7 +49,7 @@ from megloc_kapture.values import Camera, RigidTransform
 _MAX_STARTS, _START_POINTS = 5, 2500
 # alignment ends with a step this small, in pixels of the level: finest level, other levels
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
-# pixels of a level per chosen point of a reference; number of points if that gives fewer
+# pixels of a query level per point of each reference; smallest number of points
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
 # if alignment from perturbed poses decreases the cost by at least this many standard errors, the
 # unperturbed pose is not aligned at the finest level as well

@@ -68,7 +68,7 @@ def common_length(sources: Sequence[VectorBlocks]) -> int:
 
 @dataclass(frozen=True)
 class FusedSearch:
-    """Search of the ``top_k`` best database rows by one or several global features."""
+    """Search for the ``top_k`` best database rows by one or several global features."""
 
     top_k: int
     fusion: FusionOptions

@@ -223,7 +223,7 @@ def render_along(
     min_shown: float = 0.0,
     work: Work = HERE,
 ) -> int:
-    """Render all posed images of a kapture as a kapture with depth; return their number.
+    """Render the posed images of a kapture as one with depth; return the number of renderings.
 
     Parameters
     ----------

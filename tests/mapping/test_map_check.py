@@ -84,7 +84,7 @@ def one_with_nan(array: NDArray[np.floating]) -> NDArray[np.floating]:
 OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
     "keypoints as y, x": (with_pixels(lambda k: k[:, ::-1]), r"read as \(y, x\)"),
-    "larger images": (with_pixels(lambda k: k * 1.6), "images 0.625 times as large"),
+    "larger images": (with_pixels(lambda k: k * 1.6), "keypoints multiplied by 0.625"),
     "world_from_cam": (with_pose(RigidTransform.inverse), r"poses inverted \(camera-to-world"),
     "xyzw": (
         with_pose(lambda p: RigidTransform((*p.quat_wxyz[1:], p.quat_wxyz[0]), p.translation)),

@@ -29,7 +29,7 @@ _NOTHING = np.zeros((0, 2)), np.zeros((0, 3))
 # from small to large errors; also distinct with a colour vision deficiency
 _SCALE = ("#4cc3f0", "#7fd17f", "#f4d35e", "#ff9f45", "#ff4d4d")
 NO_POSE_COLOR, UNKNOWN_COLOR = "#9aa5b1", "#c9a7ff"
-# lower bounds of confidence for these colours
+# lower bounds of confidence for the first colours of _SCALE
 _CONFIDENCES = (0.95, 0.8, 0.6)
 
 
@@ -51,7 +51,7 @@ def query_facts(query: QueryResult) -> list[str]:
 
 
 def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
-    """Return the queries with true poses and colours, worst first.
+    """Return all queries, with true poses if known and colours, worst first.
 
     ``image`` is the image's name in the dataset, also for MLAD's pairs.
     """
@@ -113,7 +113,7 @@ def legend(queries: Sequence[QueryResult]) -> list[tuple[str, str]]:
 
 
 def worst_queries(queries: Sequence[QueryResult]) -> list[QueryResult]:
-    """Return the first ten of ranked queries, at least half of them with a pose if possible."""
+    """Return up to ten of the ranked queries, at least half of them with a pose if possible."""
     lost = [query for query in queries if query.cam_from_world is None]
     posed = [query for query in queries if query.cam_from_world is not None]
     num_posed = min(len(posed), max(NUM_SHOWN - len(lost), (NUM_SHOWN + 1) // 2))
