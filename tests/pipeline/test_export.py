@@ -120,7 +120,7 @@ def test_images_that_a_format_cannot_store_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="needs the file"):
         export_nerfstudio(scene(image(Camera.pinhole(6, 4, 5), pose)), tmp_path)
     two = image(Camera.pinhole(6, 4, 5), pose), image(Camera.pinhole(6, 4, 5), pose)
-    with pytest.raises(DataError, match="one timestamp"):
+    with pytest.raises(DataError, match="share a timestamp"):
         export_tum(scene(*two), tmp_path / "a.tum")
 
 
