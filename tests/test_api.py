@@ -154,11 +154,11 @@ def test_a_pose_says_what_it_rests_on(built: megloc.Map, scene: Path) -> None:
 
 
 def test_results_travel(built: megloc.Map, results: megloc.Results) -> None:
-    there = pickle.loads(pickle.dumps(results))
-    assert list(there) == list(results)
+    copied = pickle.loads(pickle.dumps(results))
+    assert list(copied) == list(results)
     for name, pose in results.items():
-        assert pose and np.array_equal(there[name].matrix, pose.matrix)
-        assert there[name].name == name and there[name].evidence == pose.evidence
+        assert pose and np.array_equal(copied[name].matrix, pose.matrix)
+        assert copied[name].name == name and copied[name].evidence == pose.evidence
     failure = megloc.Failure("dark", name="a.jpg")
     assert pickle.loads(pickle.dumps(failure)) == failure
     poses = built.kapture_map.poses

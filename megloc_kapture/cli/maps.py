@@ -138,7 +138,7 @@ class Densify(Reading, StageCommand):
     by: str | None = None
     """Estimator: sweep, colmap or a plugin; if omitted, sweep."""
     points: bool = False
-    """Also create 3D points for keypoints that have none, from their depth, with uncertainty."""
+    """Also create 3D points, with uncertainty, from the depth of keypoints without a point."""
     fuse: Path | None = None
     """Write the fused point cloud to this PLY file."""
     force: Force = False

@@ -62,9 +62,9 @@ from megloc_kapture.stages.local_features import read_frame, read_image_of
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import (
     check_points,
+    depth_of,
     depth_records,
     index_map,
-    read_depth,
     with_noise,
     write_array,
 )
@@ -236,12 +236,13 @@ def _points(
 
 
 def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDArray[np.float32]]:
-    data = folder.read()
-    record = depth_records(data)[image]
+    data, depth = folder.read(), depth_of(folder, image)
+    pose = data.cam_from_world(image)
+    assert depth is not None and pose is not None
     pixels = read_image_of(folder.image_path(image), data.camera_of(image))
-    longer = max(record.camera.width, record.camera.height)
-    view = stereo_view(pixels, data.camera_of(image), data.poses()[image], None, longer)
-    return view, read_depth(folder, record)
+    longer = max(depth.camera.width, depth.camera.height)
+    view = stereo_view(pixels, data.camera_of(image), pose, None, longer)
+    return view, depth.depth_m
 
 
 _NO_POINTS = np.zeros(0, np.int64)

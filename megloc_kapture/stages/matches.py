@@ -244,12 +244,11 @@ def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
         apart = abs(position[pair.query] - position[pair.map])
         ranked[pair.query].append((-pair.score, apart, pair.map))
         ranked[pair.map].append((-pair.score, apart, pair.query))
-    similar = {image: [other for *_, other in sorted(ranked[image])] for image in images}
     chosen: dict[str, set[str]] = defaultdict(set)
     for image in images[:: max(1, math.ceil(len(images) / _CHECKED_GROUPS))]:
-        others = list(dict.fromkeys(similar[image]))
+        others = list(dict.fromkeys(other for *_, other in sorted(ranked[image])))
         group = {image, *(others[rank] for rank in _RANKS if rank < len(others))}
-        most_similar = ((member, similar[member][0]) for member in group)
+        most_similar = ((member, min(ranked[member])[-1]) for member in group)
         for a, b in map(sorted, (*combinations(group, 2), *most_similar)):
             chosen[a].add(b)
     return [(image, sorted(others)) for image, others in sorted(chosen.items())]

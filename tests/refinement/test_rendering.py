@@ -181,7 +181,7 @@ def test_the_plugin_takes_the_first_references_that_have_depth(case: Case) -> No
     refine = partial(plugin.refine, "query", case.query.camera, start, scene=scene)
     assert refine(["flat"]).reason == "no reference image has depth" and not scene.asked
     refined = refine(["flat", "0", "1", "2"])
-    assert scene.asked == ["0", "1"]
+    assert scene.asked == ["0", "1", "query"]
     direct = refine_by_rendering(case.query, case.references[:2], start)
     assert refined.cam_from_world == direct.cam_from_world and refined.accepted
     with pytest.raises(DataError, match="does not fit a camera"):

@@ -25,7 +25,7 @@ class Scene:
     asked: list[str] = field(default_factory=list)
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
-        return self.images[name]
+        return self.map_image(name)
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
         self.asked.append(name)
