@@ -64,13 +64,15 @@ def write_csv_table(
     write_bytes(path, out.getvalue().encode("utf-8"))
 
 
-def append_csv_row(path: Path, columns: Sequence[str], row: Iterable[object]) -> None:
-    """Append a row to a table that grows until :func:`write_csv_table` replaces it."""
+def append_csv_rows(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
+    """Append rows to a table that grows until :func:`write_csv_table` replaces it."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "a", encoding="utf-8", newline="") as file:
-            header = [] if file.tell() else [columns]
-            csv.writer(file, lineterminator="\n").writerows([*header, map(_cell, row)])
+            writer = csv.writer(file, lineterminator="\n")
+            if not file.tell():
+                writer.writerow(columns)
+            writer.writerows(map(_cell, row) for row in rows)
 
 
 def _cell(value: object) -> str:

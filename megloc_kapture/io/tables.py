@@ -32,7 +32,7 @@ from megloc_kapture.io.csv_table import (
     OrNone,
     Parts,
     PoseCell,
-    append_csv_row,
+    append_csv_rows,
     columns_of,
     read_csv_table,
     read_records,
@@ -299,9 +299,9 @@ def read_match_counts(
     return read_records(path, PairCount, missing_ok=missing_ok)
 
 
-def append_match_count(features_dir: Path, type_name: str, count: PairCount) -> None:
+def append_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
     path = match_counts_path(features_dir, type_name)
-    append_csv_row(path, columns_of(PairCount), vars(count).values())
+    append_csv_rows(path, columns_of(PairCount), (vars(count).values() for count in counts))
 
 
 def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:

@@ -28,7 +28,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.tables import (
     PairCount,
-    append_match_count,
+    append_match_counts,
     read_match_counts,
     write_match_counts,
 )
@@ -171,10 +171,13 @@ def match_pairs(
     )
     results = work.map(steps, jobs, resumed_label("matching", len(ordered), len(todo)))
     for (image, others), verified_pairs in zip(jobs, results, strict=True):
+        new_counts = [
+            PairCount(image, other, pair.num_found, len(pair.matches))
+            for other, pair in zip(others, verified_pairs, strict=True)
+        ]
+        counts |= {(image, count.other): count for count in new_counts}
+        append_match_counts(output, local_type, new_counts)
         for other, pair in zip(others, verified_pairs, strict=True):
-            count = PairCount(image, other, pair.num_found, len(pair.matches))
-            counts[image, other] = count
-            append_match_count(output, local_type, count)
             writer.write(image, other, pair.matches, pair.scores)  # marks the pair as finished
     rows = [counts[pair] for pair in ordered]
     write_match_counts(output, local_type, rows)

@@ -114,7 +114,8 @@ def test_matches_equal_the_published_code(setting: int, tmp_path: Path) -> None:
             layers, dropped = data[f"stop_{setting}_{pair}"]
             assert (layers < published.LAYERS) == (depth > 0) and (dropped > 0) == (width > 0)
             np.testing.assert_array_equal(matches, data[f"matches_{setting}_{pair}"])
-            np.testing.assert_allclose(scores, data[f"scores_{setting}_{pair}"], atol=1e-4)
+            # random weights amplify the rounding of other processors to 1e-4
+            np.testing.assert_allclose(scores, data[f"scores_{setting}_{pair}"], atol=1e-3)
 
 
 def test_matches_equal_transformers(tmp_path: Path) -> None:
