@@ -175,7 +175,7 @@ _RUNS = Path("runs")
 
 @dataclass(frozen=True, kw_only=True)
 class Check(Common):
-    """Check a pose file of any tool against the rules of its challenge and the map."""
+    """Check a pose file from any tool against the rules of its challenge and the map."""
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a
