@@ -162,7 +162,7 @@ def summary(counts: Mapping[str, int]) -> str:
     parts = [
         f"{counts['missing']} missing" if counts["missing"] else "",
         "written as dummy poses" if counts["dummies"] else "",
-        f"{counts['fallbacks']} of the poses are guesses" if counts["fallbacks"] else "",
+        f"{counts['fallbacks']} fallback poses" if counts["fallbacks"] else "",
         f"{counts['from_rig']} from the rig" if counts["from_rig"] else "",
     ]
     return ", ".join([text, *filter(None, parts)])

@@ -130,7 +130,7 @@ class Evaluation(Reported):
     truth, estimated : ``cam_from_world`` of counted queries.
     without_truth : images or pairs without a true pose, sorted; reported but not counted.
     not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
-    truth_known_by : owner of true poses that are not published.
+    truth_known_by : note on true poses that are not published; else empty.
     pairs : name of a query -> its pair, for the MLAD challenges.
     nowhere : queries that show nothing of the map; recall ignores them, and their poses are wrong.
     by_center : the same pairs of MLAD, evaluated by the error of the camera centre.
