@@ -1,5 +1,5 @@
-# Every target sets up .venv by itself the first time; after that it costs nothing and needs no
-# network. `make help` lists the targets and variables.
+# The first target that runs sets up .venv; later ones neither spend time on it nor need a network.
+# `make help` lists the targets and variables.
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -12,7 +12,7 @@ ROOT ?=
 PRESET ?=
 WORKSPACE ?=
 ARGS ?=
-# make test-slow: no test begins after so many seconds
+# make test-slow: time after which no test is started
 BUDGET_S ?=
 # make bench
 SCENE ?= ../shared/data/scenes/redkitchen_rgbd
@@ -23,9 +23,9 @@ TORCH_INDEX ?=
 
 VENV ?= .venv
 BIN := $(VENV)/bin
-# named by content, not by date: a checkout alone installs nothing again
+# named by content, not by date, so that a checkout does not trigger a new installation
 CHECKSUM := $(shell cat pyproject.toml $(wildcard twins/pyproject.toml) constraints.txt | cksum | cut -d ' ' -f 1)
-# the requirements alone, and with networks and all tools
+# BASE: requirements only; STAMP: also networks and all tools
 BASE := $(VENV)/.base-$(CHECKSUM)
 STAMP := $(VENV)/.installed-$(CHECKSUM)
 INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check
@@ -34,16 +34,16 @@ help:
 	@echo 'make eval       localize a data set: import, map, localize, pose file, recall table'
 	@echo '                DATASET=$(DATASET) ROOT=folder PRESET=name WORKSPACE=folder ARGS="more options"'
 	@echo 'make test       run the quick tests: minutes; ARGS="files or options of pytest"'
-	@echo 'make test-slow  run those that it leaves out: whole runs; BUDGET_S=seconds to begin none later'
-	@echo 'make test-all   run all tests, the property tests with many new examples'
+	@echo 'make test-slow  run the slow tests (whole runs); BUDGET_S=seconds starts none after this time'
+	@echo 'make test-all   run all tests, property tests with many new examples'
 	@echo 'make lint       check style, types and the import contracts'
 	@echo 'make docs       write the API reference into build/docs, from the docstrings'
 	@echo 'make bench      measure speed; SCENE=folder, KLOC_PYTHON=.venv-kloc/bin/python to compare'
 	@echo 'make kloc-env   build .venv-kloc: kapture-localization with its old packages, and COLMAP'
-	@echo 'make hloc-env   build .venv-hloc: what hloc calls, for benchmarks/speed/hloc_side_by_side.py'
-	@echo 'make clean      remove caches; leaves .venv, runs/ and submissions/ alone'
-	@echo 'Set-up happens once, by itself, in .venv (VENV=folder): PYTHON=interpreter (3.11 or newer),'
-	@echo 'TORCH_INDEX=URL to take torch from another package index (the CPU wheels are smaller).'
+	@echo 'make hloc-env   build .venv-hloc: packages of hloc, for benchmarks/speed/hloc_side_by_side.py'
+	@echo 'make clean      remove caches; keeps .venv, runs/ and submissions/'
+	@echo 'Targets set up .venv once (VENV=folder). PYTHON=interpreter (3.11 or newer),'
+	@echo 'TORCH_INDEX=URL installs torch from another package index (the CPU wheels are smaller).'
 
 venv: $(STAMP)
 
@@ -52,17 +52,17 @@ eval: $(or $(wildcard $(STAMP)),$(if $(filter-out classic,$(PRESET)),$(STAMP),$(
 	@$(BIN)/megloc eval '$(DATASET)' $(if $(ROOT),--root '$(ROOT)') $(if $(PRESET),--preset '$(PRESET)') \
 		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') --submissions submissions $(ARGS)
 
-# a file's tests share their fixtures, so they stay together
-# the many processes that they start compile the package once, whatever the user has set
-# as many workers as cores, so each needs one thread; the few tests that ask for more leave the core
-# to the others while they wait
+# loadfile: the tests of a file share fixtures
+# PYTHONDONTWRITEBYTECODE=: the processes that tests start reuse compiled bytecode
+# one OpenMP thread per worker, since there are as many workers as cores; passive waiting frees the
+# core if a test uses more threads
 PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest --maxprocesses 4 --dist loadfile
 
-# whole runs wait for a quarter of their time, for processes and for the disk: one more worker
+# whole runs spend a quarter of their time waiting for processes and the disk, so use one more worker
 SLOW_WORKERS = $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
 
-# some disks take milliseconds to remove a folder, and the quick tests make thousands: in memory,
-# where there is room
+# some disks take milliseconds to remove a folder, and the quick tests make thousands, so use memory
+# if there is room
 IN_MEMORY = $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 4e6 { print "PYTEST_DEBUG_TEMPROOT=/dev/shm" }')
 
 test: $(STAMP)
@@ -97,7 +97,7 @@ bench: $(STAMP)
 kloc-env:
 	@PYTHON='$(PYTHON)' sh benchmarks/speed/kloc_env.sh .venv-kloc
 
-# the last pycolmap that hloc's map is not empty with; hloc itself is not in the package index
+# with newer pycolmap hloc's map is empty; hloc itself is not in the package index
 HLOC_PIP := .venv-hloc/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 hloc-env:
 	@python=$$(PYTHON='$(PYTHON)' sh scripts/find_python.sh) && "$$python" -m venv .venv-hloc
@@ -117,8 +117,8 @@ $(BASE):
 	@$(INSTALL) -c constraints.txt -e . $(addprefix -e ,$(wildcard twins))
 	@rm -f $(VENV)/.base-* && touch $@
 
-# torch first: the other packages then take the one that is there. kapture-localization is the
-# tests' oracle; its own requirements (opencv-python, cvxpy) would break the environment.
+# install torch first, so that the other packages use it. Tests compare with kapture-localization,
+# whose requirements (opencv-python, cvxpy) would break the environment.
 $(STAMP): | $(BASE)
 	@echo 'Adding networks and tools to $(VENV), once: about 2 GB of packages, a few minutes.'
 	@$(INSTALL) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') -c constraints.txt torch

@@ -273,7 +273,7 @@ def report(table: pd.DataFrame, scores: NDArray[np.float64]) -> None:
     bins = reliability(scores[posed], right)
     by_inliers = risk_by_score(table.num_inliers.to_numpy(np.float64)[posed], right).mean()
     print(
-        f"calibration error {calibration_error(bins):.3f}; area under risk against coverage "
+        f"calibration error {calibration_error(bins):.3f}; area under the risk-coverage curve "
         f"{risk_by_score(scores[posed], right).mean():.4f}, by inliers {by_inliers:.4f}, at best "
         f"{least_area(right):.4f}"
     )

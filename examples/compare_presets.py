@@ -25,6 +25,6 @@ def main(scene: Path) -> None:
     print(results[0].compare(results[1]))
 
 
-# worker processes import this file: what they shall not do stands below
+# worker processes import this file, and must not run main()
 if __name__ == "__main__":
     main(Path(sys.argv[1]))

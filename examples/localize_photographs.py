@@ -1,4 +1,4 @@
-"""Where were photographs taken? A kapture map or a COLMAP model, and plain image files.
+"""Localize image files in a kapture map or a COLMAP model.
 
 python examples/localize_photographs.py MAP PHOTO [PHOTO ...]
 """

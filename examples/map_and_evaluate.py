@@ -1,4 +1,4 @@
-"""Map images with poses, localize others in the map, and say how good that is.
+"""Map images with poses, localize other images in the map, and evaluate their poses.
 
     python examples/map_and_evaluate.py SCENE
 

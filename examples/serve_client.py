@@ -3,8 +3,8 @@
     megloc serve my_map &
     python serve_client.py photo.jpg PINHOLE,1920,1080,1371,1371,960,540
 
-The camera is as COLMAP writes it: model, width, height, parameters; --url and --token say which
-service. Needs nothing but Python.
+The camera is MODEL,WIDTH,HEIGHT,PARAMETERS, as in COLMAP; --url and --token select the service.
+Needs only the standard library.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from urllib.request import Request, urlopen
 
 
 def localize(photo: Path, camera: str, url: str, token: str = "") -> dict:
-    """The service's answer: a pose, a reason why there is none, or an error."""
+    """Return the service's answer: a pose, the reason for its absence, or an error."""
     model, width, height, *params = camera.split(",")
     sent = {"model": model, "width": int(width), "height": int(height)}
     sent["params"] = [float(one) for one in params]

@@ -222,7 +222,7 @@ def open_map(
     features_dirs: Sequence[Path | str] = (),
     pixel_origin: PixelOriginChoice = "auto",
 ) -> Map:
-    """Open a map of this package or of another tool, with all keypoint types that have points.
+    """Open a map from this package or another tool, with all keypoint types that have points.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class DataError(MeglocError):
 def require(
     condition: object, message: str, *, path: Path | str | None = None, line: int | None = None
 ) -> None:
-    """Raise DataError if the condition is false; the message is formatted in any case."""
+    """Raise DataError if the condition is false; the message is formatted even if it is true."""
     if not condition:
         raise DataError(message, path=path, line=line)
 
@@ -50,7 +50,7 @@ class OptionError(MeglocError):
 
 
 def check_option(condition: object, message: str) -> None:
-    """Raise OptionError if the condition is false; the message is formatted in any case."""
+    """Raise OptionError if the condition is false; the message is formatted even if it is true."""
     if not condition:
         raise OptionError(message)
 
@@ -60,7 +60,7 @@ class OutputError(MeglocError):
 
 
 class PluginError(MeglocError):
-    """A plugin is unknown, cannot be loaded, or does not fulfil its protocol."""
+    """A plugin is unknown, cannot be loaded, or does not implement its protocol."""
 
 
 def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> str:

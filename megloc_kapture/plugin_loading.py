@@ -57,10 +57,10 @@ def load_plugin(
         raise
     except ValidationError as error:
         fault = option_fault(error, model)
-        raise PluginError(f"plugin {name!r} refuses its options: {fault}") from error
+        raise PluginError(f"plugin {name!r} rejects its options: {fault}") from error
     except Exception as error:  # a third-party constructor may raise anything
         reason = " ".join(str(error).split())
-        raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+        raise PluginError(f"plugin {name!r} rejects its options: {reason}") from error
 
 
 def checked_array(
@@ -117,7 +117,8 @@ def plugin_class(group: str, name: str) -> Any:
     if not isinstance(kind, type) or missing:
         what = "is not a class" if not isinstance(kind, type) else f"lacks {', '.join(missing)}"
         raise PluginError(
-            f"plugin {name!r} ({entries[0].value}) does not fulfil {protocol.__name__}: it {what}"
+            f"plugin {name!r} ({entries[0].value}) does not implement {protocol.__name__}: "
+            f"it {what}"
         )
     return kind
 

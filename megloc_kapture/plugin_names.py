@@ -17,7 +17,7 @@ def entry_points(**of: str) -> Any:
 
 @cache
 def _entry_points_on(_search_path: tuple[str, ...]) -> Any:
-    """Return type Any, because Python 3.11 and 3.12 return different classes with ``select``."""
+    """Typed as Any: Python 3.11 and 3.12 return different classes with ``select``."""
     return metadata.entry_points()
 
 

@@ -276,7 +276,7 @@ class PoseRefinement:
     Attributes
     ----------
     cam_from_world : the refined pose, or the old one if rejected.
-    reason : reason of a rejection; empty if accepted.
+    reason : reason for rejection; empty if accepted.
     measures : numbers by name for tables, such as residuals before and after.
     covariance : as in :class:`Pose`, or None.
     method : name of the refiner.

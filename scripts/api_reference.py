@@ -19,9 +19,10 @@ _read_numpy = docstrings.numpy
 
 
 def _read_described(docstring: str) -> str:
-    """Markdown of a docstring in numpy's style whose ``name : text`` has no type.
+    """Return the Markdown of a numpy-style docstring with descriptions in place of types.
 
-    The signature shows the types, so what stands behind the colon describes; pdoc takes it for one.
+    The signature shows the types, so in ``name : text`` the text is a description; pdoc would
+    treat it as a type.
     """
     described = re.sub(r"^(\w+(?:, \w+)*) : (.*)$", r"\1\n    \2", docstring, flags=re.MULTILINE)
     return _read_numpy(described)
@@ -29,7 +30,7 @@ def _read_described(docstring: str) -> str:
 
 def write(folder: Path) -> None:
     """Write the pages, of which ``index.html`` is the first."""
-    # the package loads names when they are asked for; pdoc sees those that are there
+    # the package loads names lazily; pdoc sees only loaded names
     vars(megloc_kapture).update(
         {name: getattr(megloc_kapture, name) for name in megloc_kapture.__all__}
     )

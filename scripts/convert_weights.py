@@ -1,9 +1,9 @@
-"""Convert the published weights that torch cannot read safely to safetensors, once.
+"""Convert published weights that torch cannot read safely to safetensors.
 
     python scripts/convert_weights.py NAME FILE [-o OUT.safetensors]
 
-NAME is the network in the registry (``megloc weights list``), FILE what its authors publish. The
-result lies in the folder of weights, where ``megloc`` finds it, unless OUT says otherwise.
+NAME is the network in the registry (``megloc weights list``), FILE the published file. Without OUT,
+the result is written to the folder of weights, where ``megloc`` finds it.
 
     aslfeat            model.ckpt-380000.index, or aslfeat.tar: needs tensorflow
     delg-*             the SavedModel's tar.gz, or its variables.index: needs tensorflow
@@ -44,7 +44,7 @@ def read_tensorflow(path: Path) -> dict[str, np.ndarray]:
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(path) as archive:
             archive.extractall(folder, filter="data")
-        # a Mac adds ._NAME beside each NAME
+        # macOS adds a file ._NAME for each NAME
         found = [p for p in Path(folder).rglob("*.index") if not p.name.startswith("._")]
         if len(found) != 1:
             raise DataError(f"{len(found)} TensorFlow checkpoints (X.index) in it", path=path)
@@ -61,12 +61,12 @@ def _read_variables(prefix: Path) -> dict[str, np.ndarray]:
 
 
 def torch_layout(values: np.ndarray) -> torch.Tensor:
-    """Put the outputs of a kernel or a matrix first, as torch has them."""
+    """Move the output axis of a kernel or a matrix to the front, as in torch."""
     axes = {4: (3, 2, 0, 1), 2: (1, 0)}.get(values.ndim, range(values.ndim))
     return torch.from_numpy(np.array(values.transpose(axes), order="C"))
 
 
-# what optimisers keep beside a variable, under its name, and beside all of them
+# optimiser state: last parts of variable names, per variable and global
 OPTIMISER_WORDS = (
     *("Adam", "Adam_1", "Momentum", "RMSProp", "RMSProp_1", "ExponentialMovingAverage"),
     *("global_step", "beta1_power", "beta2_power", "learning_rate"),
@@ -75,7 +75,7 @@ _TORCH_WORDS = {"kernel": "weight", "moving_mean": "running_mean", "moving_varia
 
 
 def aslfeat_state(variables: Arrays) -> Tensors:
-    """Return the state dict of AslFeatNet: dots for slashes, and torch's words at the end."""
+    """Return the state dict of AslFeatNet, with dots for slashes and torch's parameter names."""
     state = {}
     for name, values in variables.items():
         scope, _, word = name.rpartition("/")
@@ -85,12 +85,12 @@ def aslfeat_state(variables: Arrays) -> Tensors:
     return state
 
 
-# Three ways of naming DELG's variables are known; any scope may stand before them.
+# Three naming schemes of DELG's variables are known; any scope may precede the names.
 #   objects   backbone/l2a/conv2a/kernel, backbone/l2a/bn_shortcut/gamma: attributes of the public
 #             training code; in an exported model the variables of a block may have numbers
 #   layers    res2a_branch2a/kernel, bn2a_branch1/gamma: the same layers in a graph of TF1
-#   slim      resnet_v1_50/block1/unit_1/bottleneck_v1/conv1/weights: TF-Slim's ResNet, whose layer
-#             after the pooling is known by its shape only
+#   slim      resnet_v1_50/block1/unit_1/bottleneck_v1/conv1/weights: TF-Slim's ResNet; its layer
+#             after the pooling is identified by its shape
 _ATTRIBUTE = "/.ATTRIBUTES/VARIABLE_VALUE"
 _CONVOLUTION = {"kernel": "weight", "bias": "bias"}
 _SLIM_CONVOLUTION = {"weights": "weight", "biases": "bias"}
@@ -100,7 +100,7 @@ _NORM = {
     "moving_mean": "running_mean",
     "moving_variance": "running_var",
 }
-# of a block, convolution and norm: the branch in Keras' names to torchvision's attributes
+# branch of a block in Keras' names -> torchvision's attributes for convolution and norm
 _PARTS = {
     "2a": ("conv1", "bn1"),
     "2b": ("conv2", "bn2"),
@@ -120,7 +120,7 @@ def delg_state(variables: Arrays) -> Tensors:
     for names in (_keras_names(layers=False), _keras_names(layers=True), _slim_names()):
         keys, state = dict(names), {}
         for name, values in variables.items():
-            if "attention/" in name:  # the local branch, which has a bn_conv1 of its own
+            if "attention/" in name:  # the local branch, which also has a bn_conv1
                 continue
             parts = name.split("/")
             scoped = ("/".join(parts[start:]) for start in range(len(parts)))
@@ -137,7 +137,7 @@ def delg_state(variables: Arrays) -> Tensors:
 
 
 def _keras_names(*, layers: bool) -> Iterator[tuple[str, str]]:
-    """Yield names of the kind ``objects`` or ``layers``, without a scope, and the module's keys."""
+    """Yield names of scheme ``objects`` or ``layers``, without a scope, and the module's keys."""
     above = "" if layers else "backbone/"
     for layer, key, words in _STEM:
         yield from ((f"{above}{layer}/{word}", f"{key}.{own}") for word, own in words.items())
@@ -189,15 +189,15 @@ def _embedding_by_shape(variables: Arrays) -> Tensors:
 
 # -------------------------------------------------------------------------------------- MATLAB
 
-# numbers of the convolutions in torchvision's VGG-16
+# indices of the convolutions in torchvision's VGG-16
 _CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 
 
 def netvlad_state(path: Path) -> Tensors:
-    """Return NetVLAD's tensors under OpenIBL's names, of the authors' struct ``net``.
+    """Return the tensors of NetVLAD's struct ``net`` under OpenIBL's names.
 
-    Its layers with weights are the 13 convolutions of VGG-16, NetVLAD's layer and the whitening,
-    whose inputs lie with the cluster's number running fastest. ``average_image`` is RGB, 0 to 255.
+    Its layers with weights are the 13 convolutions of VGG-16, NetVLAD's layer and the whitening, in
+    whose inputs the cluster index runs fastest. ``average_image`` is RGB, 0 to 255.
     """
     from scipy.io import loadmat
 
@@ -236,11 +236,11 @@ class Pca:
 
 
 def apgem_state(path: Path) -> Tensors:
-    """Return AP-GeM's state dict, and under names of our own what its file holds beside it.
+    """Return AP-GeM's state dict and, under additional names, the other data in its file.
 
     These are ``pca.NAME.{mean,components,explained_variance,whiten}``, ``preprocess.{mean,std}``
-    and ``model_options.norm_features``. Read by torch's restricted unpickler, which may build
-    numpy's arrays and the class above, and runs nothing of the file.
+    and ``model_options.norm_features``. torch's restricted unpickler may create only numpy arrays
+    and the class above, and executes no code in the file.
     """
     core = np._core.multiarray  # type: ignore[attr-defined]
     allowed: list[Any] = [np.ndarray, np.dtype]

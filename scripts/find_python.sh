@@ -1,6 +1,6 @@
 #!/bin/sh
-# Print a Python that can make the virtual environment, or say in one line what is missing.
-# 3.11 is tried first: the pinned versions are tested with it. PYTHON names another one.
+# Print a Python that can create the virtual environment, or one line about what is missing.
+# 3.11 is tried first, because the pinned versions are tested with it. PYTHON overrides the choice.
 set -u
 
 can_run() {

@@ -141,7 +141,7 @@ def test_what_cannot_be_planned_is_refused(scene: Path) -> None:
     with pytest.raises(PluginError, match="no plugin 'count_points' in megloc_kapture.stages"):
         planned(scene, {"count_points": {}})
     with pytest.raises(
-        PluginError, match="'count_keypoints' refuses its options: unknown option 'most'"
+        PluginError, match="'count_keypoints' rejects its options: unknown option 'most'"
     ):
         planned(scene, {"count_keypoints": {"most": 1}})
     kind = sys.modules["keypoint_counts"].CountKeypoints

@@ -104,13 +104,16 @@ def test_a_plugin_of_another_package_is_found_and_works(outside: Path) -> None:
     [
         (
             "nameless",
-            r"'nameless' \(outside_plugin:Nameless\) does not fulfil Loc.*: it lacks name",
+            r"'nameless' \(outside_plugin:Nameless\) does not implement Loc.*: it lacks name",
         ),
-        ("deaf", r"'deaf' \(outside_plugin:Deaf\) does not fulfil LocalFeatureE.* lacks extract"),
-        ("function", r"'function' .* does not fulfil LocalFeatureExtractor: it is not a class"),
+        (
+            "deaf",
+            r"'deaf' \(outside_plugin:Deaf\) does not implement LocalFeatureE.* lacks extract",
+        ),
+        ("function", r"'function' .* does not implement LocalFeatureExtractor: it is not a class"),
         ("absent", r"'absent' \(outside_plugin:Absent\) cannot be loaded: .*Absent"),
         ("broken", r"'broken' \(outside_plugin_broken:Grid\) cannot be loaded: no licence"),
-        ("moody", r"'moody' refuses its options: not today"),
+        ("moody", r"'moody' rejects its options: not today"),
         (
             "missing",
             r"no plugin 'missing' in megloc_kapture.local_features; registered: .*rootsift",
@@ -128,13 +131,13 @@ def test_a_wrong_plugin_is_refused_by_name_with_the_reason(
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("grid", {"step": "wide"}, r"'grid' refuses its options: .*step.* valid integer"),
+        ("grid", {"step": "wide"}, r"'grid' rejects its options: .*step.* valid integer"),
         (
             "grid",
             {"steps": 3},
-            r"'grid' refuses its options: unknown option 'steps'; did you mean 'step'",
+            r"'grid' rejects its options: unknown option 'steps'; did you mean 'step'",
         ),
-        ("plain", {"step": 3}, r"'plain' refuses its options: it takes no options, got step"),
+        ("plain", {"step": 3}, r"'plain' rejects its options: it takes no options, got step"),
     ],
 )
 def test_wrong_options_are_refused(
@@ -153,7 +156,7 @@ def test_wrong_options_are_refused(
             MATCHERS,
             "crossed",
             "megloc_kapture.features.rootsift:RootSift",
-            "does not fulfil Matcher: it lacks match",
+            "does not implement Matcher: it lacks match",
         ),
     ],
     ids=["the same name", "no matcher"],

@@ -288,7 +288,7 @@ class Deciding(Choosing):
 
     min_confidence: float | None = None
     """Reject poses with a lower confidence (0 to 1); 0 keeps every pose, for challenges, where a
-    wrong pose costs nothing. If omitted, 0.6, or 0 for megloc eval."""
+    wrong pose costs no more than a missing one. If omitted, 0.6, or 0 for megloc eval."""
 
     def assignments(self) -> tuple[str, ...]:
         if self.min_confidence is None:

@@ -162,7 +162,7 @@ def summary(counts: Mapping[str, int]) -> str:
     parts = [
         f"{counts['missing']} missing" if counts["missing"] else "",
         "written as dummy poses" if counts["dummies"] else "",
-        f"{counts['fallbacks']} of the poses are guesses" if counts["fallbacks"] else "",
+        f"{counts['fallbacks']} fallback poses" if counts["fallbacks"] else "",
         f"{counts['from_rig']} from the rig" if counts["from_rig"] else "",
     ]
     return ", ".join([text, *filter(None, parts)])
@@ -175,7 +175,7 @@ _RUNS = Path("runs")
 
 @dataclass(frozen=True, kw_only=True)
 class Check(Common):
-    """Check a pose file of any tool against the rules of its challenge and the map."""
+    """Check a pose file from any tool against the rules of its challenge and the map."""
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a

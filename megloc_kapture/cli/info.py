@@ -159,7 +159,7 @@ def describe_refinement(console: Console, folder: KaptureFolder) -> None:
     if len(known):
         at = np.quantile(known, _QUANTILES)
         text = ", ".join(f"{100 * q:g} %: {d:.3g}" for q, d in zip(_QUANTILES, at, strict=True))
-        line(console, "", f"largest deviation for 1 px in the images, {text}")
+        line(console, "", f"largest standard deviation for 1 px of noise, percentiles: {text}")
 
 
 def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:

@@ -106,7 +106,7 @@ def _parser(given: Sequence[str]) -> Any:
 
 
 def _say_stopped(how: str) -> None:
-    print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
+    print(f"megloc: {how}; run the same command again to resume", file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

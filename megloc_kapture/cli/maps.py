@@ -82,7 +82,7 @@ class MapPhotographs(Choosing, Working):
 
 @dataclass(frozen=True, kw_only=True)
 class RefineMap(Reading, StageCommand):
-    """Remove points and observations that a map's images or depth maps contradict.
+    """Remove points and observations that a map's depth maps contradict.
 
     --set refinement.uncertainty.max_robust_sigmas=2.5 also rejects uncertain points; if it is
     omitted, the preset decides.
@@ -162,8 +162,8 @@ class Densify(Reading, StageCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class RefinePoses(Linked, StageCommand):
-    """Refine the poses of localized queries; a pose that does not improve is kept, with the
-    reason."""
+    """Refine the poses of localized queries; a refined pose that is no better is rejected, with
+    the reason."""
 
     input: Input
     """Kapture map, with images and depth maps. Read only."""

@@ -319,7 +319,7 @@ class PairsQuery(Reading, StageCommand):
 
     def run(self, console: Console) -> None:
         if (self.rerank is None) != (self.matches_dir is None):
-            raise OptionError("--rerank N needs --matches-dir DIR for its matches, and the reverse")
+            raise OptionError("--rerank N needs --matches-dir DIR for its matches, and vice versa")
         _refuse_existing(self.output, force=self.force)
         mapping = self.kapture_map(self.input)
         query = self.kapture(self.query)

@@ -96,7 +96,7 @@ class TrainField(Linked, Common):
     output: Output
     """Folder of the field: field.json and field.safetensors."""
     kind: Literal["triplane", "nerfw"] = "triplane"
-    """triplane: minutes on a CPU; nerfw: the published network, which needs a GPU."""
+    """triplane: minutes on a CPU; nerfw: the published network, for a GPU."""
     steps: int = 4000
     """Number of training steps."""
     minutes: float | None = None

@@ -221,7 +221,7 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
     check_option(
         weights.commercial or accepted,
         f"{weights.name} needs your consent to its licence: {weights.licence}: {weights.terms} "
-        f"(whole text at {weights.page}); to agree, add --accept-licence",
+        f"(full text at {weights.page}); to agree, add --accept-licence",
     )
     return weights, file, file.url
 

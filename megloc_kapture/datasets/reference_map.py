@@ -255,7 +255,7 @@ def _keypoints_of(
     if fits:
         shifts = np.abs(keypoints[features] - xy_px)
         fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
-    require(fits, f"is not of this model: its features of {stored!r} differ", path=database.path)
+    require(fits, f"does not fit this model: features of {stored!r} differ", path=database.path)
     return keypoints, features
 
 

@@ -79,7 +79,7 @@ class MedianDifference:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Comparison(Reported):
-    """Results on the same queries, compared two by two."""
+    """Results on the same queries, compared pairwise."""
 
     evaluations: tuple[Evaluation, ...]
     tests: tuple[PairedTest, ...]

@@ -5,7 +5,7 @@ query that shows nothing of the map is wrong.
 
 Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015
 (calibration error); Geifman and El-Yaniv, "Selective classification for deep neural networks",
-NeurIPS 2017 (risk against coverage).
+NeurIPS 2017 (risk-coverage curve).
 """
 
 from __future__ import annotations

@@ -130,9 +130,9 @@ class Evaluation(Reported):
     truth, estimated : ``cam_from_world`` of counted queries.
     without_truth : images or pairs without a true pose, sorted; reported but not counted.
     not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
-    truth_known_by : owner of true poses that are not published.
+    truth_known_by : note on true poses that are not published; else empty.
     pairs : name of a query -> its pair, for the MLAD challenges.
-    nowhere : queries that show nothing of the map, in no row of recall; a pose of one is wrong.
+    nowhere : queries that show nothing of the map; recall ignores them, and their poses are wrong.
     by_center : the same pairs of MLAD, evaluated by the error of the camera centre.
     covariance : counts of localized poses: ``num_poses`` have a covariance, ``num_within`` have the
         true pose in its 95 % region.
@@ -329,7 +329,7 @@ def evaluate_pairs(
     *,
     thresholds: Sequence[Threshold] | None = None,
 ) -> Evaluation:
-    """Evaluate by MLAD's metric: every pair counts once; of several files, each is a condition.
+    """Evaluate by MLAD's metric: every pair counts once; with several files, each is a condition.
 
     A pair has the name of its query; a query in several pairs is named "QUERY from REFERENCE,
     FILE". Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the

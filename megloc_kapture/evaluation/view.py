@@ -193,7 +193,7 @@ def scene_of(
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
     page, _ = top_view(quats, centers)
-    # cameras and points separately, so that ten cameras count next to a thousand points
+    # cameras and points separately, so that a thousand points do not outweigh ten cameras
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
     # rounded, so that the JSON has the exact origin

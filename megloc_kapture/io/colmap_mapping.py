@@ -3,7 +3,7 @@
 The mappers are COLMAP's incremental one (Schoenberger and Frahm, CVPR 2016) and GLOMAP (Pan et al.,
 ECCV 2024). A stereo workspace holds undistorted ``images/NAME``, a model with PINHOLE cameras in
 ``sparse/``, and maps in ``stereo/{depth_maps,normal_maps}/NAME.KIND.bin``: the text ``W&H&C&``,
-then float32 by channels.
+then float32 channel by channel.
 """
 
 from __future__ import annotations

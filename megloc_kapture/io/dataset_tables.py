@@ -137,7 +137,7 @@ class Protocol(Options):
     pose_file_names : the pose file has ``full`` image names, or ``basename`` without folders.
     pose_file_stem : STEM of the server's ``STEM_eval_METHOD.txt``; if empty, the value of
         ``dataset``.
-    truth : owner of the ground truth, if it is not published.
+    truth : note on true poses that are not published; else empty.
     conditions : order of the conditions in reports.
     pools : name -> conditions that are reported together, for example "day" for dawn and noon.
     """

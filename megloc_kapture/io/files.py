@@ -159,7 +159,7 @@ def output_error(path: Path | str, error: OSError) -> OutputError:
 
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Convert an ``OSError`` to the :class:`OutputError` of writing ``path``."""
+    """Convert an ``OSError`` from writing ``path`` to an :class:`OutputError`."""
     try:
         yield
     except OSError as error:

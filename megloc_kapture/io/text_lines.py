@@ -52,7 +52,7 @@ def fields_of(text: str) -> list[str]:
 
 
 def numbers_of(fields: Sequence[str], form: str) -> list[float]:
-    """Parse finite numbers, as many as the blank-separated names in ``form``."""
+    """Parse one finite number for each blank-separated name in ``form``."""
     try:
         values = list(map(float, fields))
     except ValueError:

@@ -69,8 +69,8 @@ _INDEPENDENT = 30
 # matches were verified with the given focal length, which biases the estimate towards it by this
 # share of their difference
 _BIASED_BY = 0.1
-# a photograph whose focal length differs from the shared one by more standard deviations has
-# another zoom
+# a photograph whose focal length differs from the shared one by more standard deviations was taken
+# with another zoom
 _MAX_SIGMAS = 3.0
 # factor on the standard deviation of the shared focal length, because errors of the map and of the
 # lens model are correlated between photographs

@@ -34,7 +34,7 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
 def most_shared(
     first, last, starts, of_image, images, track, track_starts, window, min_shared, best
 ):
-    """Fill rows ``first`` to ``last`` of ``best`` (I, K) with the images that share most points.
+    """Fill rows ``first`` to ``last`` of ``best`` (I, K) with images that share the most points.
 
     Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations are sorted by
     track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``. At most

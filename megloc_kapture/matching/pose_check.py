@@ -95,10 +95,10 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
 def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
     """Return the images with contradicting poses, and the number of images with an agreeing pair.
 
-    A pair weighs as much as it has matches. Pairs that only look alike have few, and are left out
-    below half of the usual number, the median over the images of their largest number. A wrong pose
-    also affects the pairs with images whose poses are correct, so the worst image is removed first,
-    repeatedly. A single pair is no evidence against an image.
+    The weight of a pair is its number of matches. Pairs that only look alike have few, and are left
+    out below half of the usual number, the median over the images of their largest number. A wrong
+    pose also affects the pairs with images whose poses are correct, so the worst image is removed
+    first, repeatedly. A single pair is no evidence against an image.
     """
     largest: dict[str, int] = {}
     for pair in pairs:

@@ -1,4 +1,4 @@
-"""Combination of the matches of a pair and of its variants, and of their keypoints.
+"""Combination of a pair's matches and keypoints with those of its variants.
 
 MegLoc, section "Guided pyramid matching": ALL is the union of the matches; MAX has the matches of
 the variant with the most matches. A keypoint has at most one match per other image.
@@ -33,7 +33,7 @@ class Combined:
     Attributes
     ----------
     matches, scores : int64 (K, 2) and float64 (K,).
-    best : index of the variant with the most matches; None if it has no more than the originals.
+    best : index of the variant with the most matches; None if the base has as many.
     added : per image int64 (A, 2), indices of the variant and of its match for each appended
         keypoint.
     """
@@ -52,10 +52,10 @@ def combine(
 ) -> Combined:
     """Combine the matches of a pair and its variants, and append their keypoints.
 
-    The base matches (K, 2) come first. The variants follow by number of matches, their matches by
-    score; matches of keypoints that already have a match are skipped. With ``max``, the variant
-    with the most matches replaces the base if it has more. The second image's keypoints may be None
-    if that image has no variants.
+    The base matches (K, 2) come first. Then come the variants, those with the most matches first,
+    and the matches of each by score; keypoints that already have a match are skipped. With ``max``,
+    the variant with the most matches replaces the base if it has more. The second image's keypoints
+    may be None if that image has no variants.
     """
     base_matches, base_scores = base
     order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))

@@ -83,8 +83,9 @@ def load_lightglue(
     """Build LightGlue (Lindenberger et al., ICCV 2023) from one of the authors' files.
 
     By default the network stops early (``depth_confidence``) and drops keypoints
-    (``width_confidence``), as the authors' does. With -1, which disables these, the tensors that
-    only they need may be missing. Positional encoding and assignment are never in half precision.
+    (``width_confidence``), as the authors' does. A value of -1 disables either; tensors that
+    only it needs may then be missing. Positional encoding and assignment are never in half
+    precision.
     """
     tensors = {
         _BLOCK.sub(r"transformers.\2.\1.", key): value

@@ -53,7 +53,7 @@ def window_maximum(values: torch.Tensor, radius: int) -> torch.Tensor:
     for axis in (-1, -2):
         padding = [radius, radius] if axis == -1 else [0, 0, radius, radius]
         values = functional.pad(values, padding, value=lowest)
-        reach, side = 1, 2 * radius + 1  # an entry is the maximum of `reach` entries from it on
+        reach, side = 1, 2 * radius + 1  # an entry is the maximum of itself and the next reach - 1
         while reach < side:
             step = min(reach, side - reach)
             length = values.shape[axis] - step

@@ -39,7 +39,7 @@ class ImageKeypoints:
 class SuperGlueNet(nn.Module):
     """SuperGlue's network from keypoints of image pairs to log assignments.
 
-    The last of ``encoder_sizes`` is the descriptor size D; ``num_layers`` alternate self and cross
+    The last of ``encoder_sizes`` is the descriptor size D; the layers alternate self and cross
     attention.
     """
 

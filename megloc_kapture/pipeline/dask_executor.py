@@ -22,7 +22,7 @@ from megloc_kapture.errors import MeglocError, OptionError, check_option
 from megloc_kapture.pipeline.executors import enter_single_threaded
 
 _CONNECT_S = 10.0
-# tolerates dead workers, but not an item that kills ten of them
+# tolerates dead workers, but not an item that kills more than ten of them
 _ALLOWED_FAILURES = 10
 _ITEMS_PER_WORKER = 4
 _PACKAGES = ["megloc_kapture", "numpy", "torch"]
@@ -60,7 +60,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             yield executor
         except KilledWorker as error:
             raise MeglocError(
-                f"one work item killed {_ALLOWED_FAILURES} workers, perhaps out of memory; "
+                "one work item killed too many workers, perhaps out of memory; "
                 "try fewer workers per machine"
             ) from error
         except ModuleNotFoundError as error:

@@ -144,5 +144,5 @@ def _kill(pool: ProcessPoolExecutor) -> None:
     for process in list((pool._processes or {}).values()):
         process.kill()
     if pool._result_queue is not None:
-        # otherwise a thread of the pool waits for the rest of an unfinished result
+        # otherwise a thread of the pool waits forever for an incomplete result
         pool._result_queue._writer.close()  # type: ignore[attr-defined]

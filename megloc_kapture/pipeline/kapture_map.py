@@ -1,4 +1,4 @@
-"""Read-only kapture map of any tool, for the localizer."""
+"""Read-only kapture map from any tool, for the localizer."""
 
 from __future__ import annotations
 

@@ -363,7 +363,7 @@ class MapMatching:
     @cached_property
     def _counted_types(self) -> Sequence[str]:
         names = [local.name for local in self.types]
-        # a map of another tool may lack the types of the preset
+        # a map from another tool may lack the types of the preset
         return self.options.reranking.types_named(names) or names
 
     def _permitted(self, query: Query) -> list[str]:

@@ -28,7 +28,7 @@ _ALONE = RigidTransform.identity()
 
 
 class Localizer:
-    """Estimates camera poses in a map of any tool, by the same steps as ``megloc eval``.
+    """Estimates camera poses in a map from any tool, by the same steps as ``megloc eval``.
 
     Matches of all keypoints types form one pose problem. Query features are given, or extracted if
     an extractor plugin for the map's type is installed. Candidates are ranked by global features;

@@ -521,7 +521,7 @@ def _check_name(name: str, path: Path) -> None:
         raise DataError(f"{error.message}; rename the file", path=path) from error
     require(
         name == writable_name(name),
-        f"kapture's tables cannot hold the name {name!r} (a comma, a space at an end, or # at "
-        "its beginning); rename the file",
+        f"kapture's tables cannot hold the name {name!r} (a comma, a leading or trailing space, or "
+        "a leading #); rename the file",
         path=path,
     )

@@ -46,7 +46,7 @@ _KEEP_EVERY = 200
 class FieldTrainingOptions(NetworkOptions):
     kind: Kind = Field(
         default="triplane",
-        description="triplane: minutes on a CPU; nerfw: needs a GPU",
+        description="triplane: minutes on a CPU; nerfw: for a GPU",
     )
     steps: int = Field(default=4000, gt=0, description="number of training steps")
     minutes: float | None = Field(

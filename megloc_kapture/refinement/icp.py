@@ -86,8 +86,8 @@ class IcpOptions(Options):
     )
     accept_always: bool = Field(
         default=False,
-        description="accept refined poses without tests of overlap, residual, movement and "
-        "condition number, unless it is infinite",
+        description="accept refined poses without tests of overlap, residual and movement, unless "
+        "the condition number is infinite",
     )
     min_points: int = Field(
         default=1000,
@@ -247,7 +247,7 @@ def _reason_too_far(start: RigidTransform, end: RigidTransform, options: IcpOpti
         return f"the pose moved by {moved_m:.3f} m, at most {options.max_moved_m:g} m is allowed"
     if moved_deg > options.max_moved_deg:
         return (
-            f"the pose turned by {moved_deg:.2f} deg, at most {options.max_moved_deg:g} deg "
+            f"the pose rotated by {moved_deg:.2f} deg, at most {options.max_moved_deg:g} deg "
             "is allowed"
         )
     return ""
@@ -290,7 +290,7 @@ def map_cloud(
 ) -> Floats:
     """Return the map's points (M, 3) around a query under its estimated pose.
 
-    They come from the depth maps of the references with most overlap, of which none are within
+    They come from the depth maps of the references with the most overlap, no two of them within
     0.2 m and 10 deg of each other. Without depth maps they are the map points that the references
     observe, which must be dense.
     """

@@ -51,8 +51,8 @@ _MAX_STARTS, _START_POINTS = 5, 2500
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
 # pixels of a query level per point of each reference; smallest number of points
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
-# if alignment from perturbed poses decreases the cost by at least this many standard errors, the
-# unperturbed pose is not aligned at the finest level as well
+# if alignment from perturbed poses decreases the cost by at least this many standard errors,
+# alignment from the unperturbed pose is skipped
 _CLEAR = 4.0
 
 
@@ -94,7 +94,7 @@ def displacement_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> Displacement | None:
-    """Return the displacement of a presumably correct pose by :func:`refine_by_rendering`.
+    """Return how far :func:`refine_by_rendering` moves a presumably correct pose.
 
     If the result is rejected, the displacement is that of the nearest minimum. None if overlap or
     correlation is too small, the images do not determine the pose, or the minimum is out of bounds.

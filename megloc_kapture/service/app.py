@@ -34,7 +34,7 @@ _PAGE_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src blob: data:; connect-src 'self'"
 )
-# read too large requests up to this multiple of the limit, so that clients receive the error
+# read oversized requests up to this multiple of the limit, so that clients receive the error
 _READ_BEYOND_LIMIT = 3
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _FORM = {

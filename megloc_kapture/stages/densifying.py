@@ -1,7 +1,7 @@
 """Stage: multi-view stereo depth of map images without a depth sensor.
 
 The output is the input map with depth added. Depth maps are kapture depth records of a sensor
-``CAMERA_mvs`` at the camera's centre, float32, 0 = unknown. Files outside the kapture format are
+``CAMERA_mvs`` with the camera's pose, float32, 0 = unknown. Files outside the kapture format are
 ``sensors/mvs/IMAGE.sigma.npy`` (float32, standard deviation of depth), ``IMAGE.normals.npy`` (int8
 (H, W, 3), 127 times the unit normal in the camera frame, towards the camera) and
 ``reconstruction/depth.csv``, a row per image.
@@ -247,14 +247,14 @@ def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDA
 
 _NO_POINTS = np.zeros(0, np.int64)
 _ANCHOR_VIEWS = 2  # views that must agree with a keypoint's depth before it is lifted
-# median reprojection error with exact poses, in image pixels; more is attributed to the poses
+# median reprojection error with exact poses, in image pixels; the excess is attributed to the poses
 _KEYPOINT_ERROR_PX = 0.3
 # largest median pose error in pixels of a depth map, and tolerated difference between views in
 # multiples of the pose error
 _ERROR_PX, _DIFFERENCE = 0.5, 5.0
 # standard deviation between two views per median error: the median distance in a plane is 1.1774
-# standard deviations; two views differ by sqrt(2); and points triangulated from three views have
-# absorbed half of the variance, another sqrt(2)
+# standard deviations; a factor of sqrt(2) is for the difference of two views, another because
+# points triangulated from three views have absorbed half of the variance
 _DEVIATION = 2 / 1.1774
 
 # number of source images per image, and largest number if the poses are not exact
@@ -478,7 +478,7 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
 
 
 def _estimate(job: _Job) -> str:
-    """Estimate one image's depth into the scratch folder; return the reason of a failure, or ""."""
+    """Estimate an image's depth into the scratch folder; return the reason if it fails, else ""."""
     folder, size = job.folder.open(), job.fit.max_size_px
     try:
         views = [_view(folder, image, size) for image in (job.image, *job.sources)]
@@ -496,7 +496,7 @@ def _estimate(job: _Job) -> str:
 
 
 def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
-    """Write the depth that sources confirm; return its proportion of pixels, and lifted points."""
+    """Write the depth that sources confirm; return its share of the pixels, and lifted points."""
     folder, size = job.folder.open(), job.fit.max_size_px
     view = _view(folder, job.image, size)
     names = ("depth", "sigma", "normals")

@@ -233,7 +233,7 @@ def _seen_points(
         points.append(observations.point_ids[image_ids >= 0])
         seeing.append(image_ids[image_ids >= 0])
     point_ids = np.concatenate(points)
-    require(len(point_ids) != 0, "no image to be paired observes its points", path=folder.root)
+    require(len(point_ids) != 0, "none of the images to pair observes its points", path=folder.root)
     return point_ids, np.concatenate(seeing)
 
 

@@ -158,7 +158,7 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
 
 
 Unit = tuple[tuple[str, RigidTransform], ...]
-"""Images that get one pose, sorted by name, with the ``cam_from_rig`` of each."""
+"""Images localized jointly, sorted by name, with the ``cam_from_rig`` of each."""
 
 
 def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:

@@ -221,9 +221,9 @@ class Work:
     ) -> Iterator[Result]:
         """Yield results in the order of the items, with a progress bar.
 
-        ``function`` must be picklable. ``plugins`` are those that it calls; a :class:`Batched` has
-        its plugin itself. If a plugin uses a GPU of this machine, threads of this process do the
-        work, so that no other process takes GPU memory.
+        ``function`` must be picklable. ``plugins`` are those that it calls; a :class:`Batched`
+        names its own. If a plugin uses a GPU of this machine, threads of this process do the work,
+        so that no other process takes GPU memory.
         """
         if total is None:
             items = items if isinstance(items, Sequence) else list(items)

@@ -90,7 +90,7 @@ class FrozenFeatures:
 
 
 class SuperPointDescriber(nn.Module):
-    """SuperPoint's backbone and descriptor head; saved as option ``descriptor_weights``."""
+    """SuperPoint's backbone and descriptor head, saved for the option ``descriptor_weights``."""
 
     def __init__(self, extractor: SuperPoint) -> None:
         super().__init__()

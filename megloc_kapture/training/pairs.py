@@ -94,9 +94,9 @@ class PosedPairs:
             overlaps = np.fromiter(shares, np.float64, len(near))
         if not len(near):
             raise DataError(
-                "no two images have a pose and a depth map of their timestamp (trajectories.txt, "
-                "records_depth.txt) and viewing directions within "
-                f"{_CANDIDATES.max_angle_deg:g} degrees",
+                "no two images with a pose (trajectories.txt) and a depth map of their timestamp "
+                "(records_depth.txt) have viewing directions within "
+                f"{_CANDIDATES.max_angle_deg:g} degrees of each other",
                 path=folder.root,
             )
         if measured is not None and not measured.is_file():

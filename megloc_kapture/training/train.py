@@ -159,7 +159,7 @@ class Trainer:
         options, losses = self.options, []
         steps = range(self.step, options.steps)
         threaded = ThreadPoolExecutor(threads) if threads > 1 else nullcontext()
-        # disable TF32 for all threads: feature extraction in a thread would toggle it in a step
+        # disable TF32 for all threads: feature extraction in a thread would toggle it during a step
         with without_tf32(self._device), threaded as pool:
             prepared = ordered_map(
                 lambda step: self._pairs(sources, step), steps, pool, window=2 * threads

@@ -89,8 +89,8 @@ def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path, tmp_pa
     assert done.status == 0
     flat = " ".join(done.out.split())
     assert (
-        "At 0.25 m, 2 deg a finds 12 queries that b misses and b finds none that a misses: the "
-        "difference is real (p = 0.0015)."
+        "At 0.25 m, 2 deg a localizes 12 queries that b misses and b localizes none that a misses: "
+        "the difference is real (p = 0.0015)."
     ) in flat  # 2 * 0.5^12, times the three thresholds
     comparison = json.loads((out / "recall.json").read_text())["comparison"]
     assert comparison["tests"][0]["only_first"] == sorted(IMAGES[2:14])
@@ -99,7 +99,7 @@ def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path, tmp_pa
     poses = tmp_path / "poses.txt"
     write_pose_file(poses, poses_off(0.01, 2), names="basename")
     done = megloc(*results(runs, "a"), "-i", poses, "--gt", runs / "a/query_gt")
-    assert "/poses.txt find the same 38 queries" in " ".join(done.out.split())
+    assert "/poses.txt localize the same 38 queries" in " ".join(done.out.split())
 
 
 def test_results_without_truth_are_compared_with_each_other(

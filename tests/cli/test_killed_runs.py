@@ -96,7 +96,7 @@ def test_ctrl_c_says_how_to_continue_and_keeps_finished_items(scene: Path, tmp_p
     # a terminal sends the signal to every process of the group
     os.killpg(run.pid, signal.SIGINT)
     assert run.stderr is not None
-    message = "megloc: interrupted; run the same command again to go on"
+    message = "megloc: interrupted; run the same command again to resume"
     assert message in run.stderr.read().splitlines()
     assert run.wait() == 130
     assert not (workspace / "local_features").exists()

@@ -75,7 +75,7 @@ def test_sigterm_ends_with_143_and_says_how_to_continue(
     finally:
         signal.signal(signal.SIGTERM, before)
     assert end.value.code == 143
-    message = "megloc: terminated; run the same command again to go on\n"
+    message = "megloc: terminated; run the same command again to resume\n"
     assert capsys.readouterr().err == message
 
 

@@ -117,7 +117,7 @@ def test_eval_names_all_missing_weights_of_a_preset(
 
 def test_a_restricted_licence_needs_consent_before_any_download(megloc: Any, folder: Path) -> None:
     message = megloc("weights", "fetch", "free", "bound").refused(
-        r"bound needs your consent to its licence: SHORT: for looking at only \(whole text at http",
+        r"bound needs your consent to its licence: SHORT: for looking at only \(full text at http",
         "add --accept-licence",
     )
     assert "free needs" not in message

@@ -139,8 +139,8 @@ def test_all_features_of_a_database_keep_their_numbers(tmp_path: Path) -> None:
     ("names", "options", "match"),
     [
         ({"db/a.png": 10}, {}, "has no image 'db/b.jpg'"),
-        ({**FEATURES, "db/b.png": 900}, {}, "not of this model: its features of 'db/b.png'"),
-        (FEATURES, {"shift": 1.5}, "not of this model: its features of 'db/a.png'"),
+        ({**FEATURES, "db/b.png": 900}, {}, "does not fit this model: features of 'db/b.png'"),
+        (FEATURES, {"shift": 1.5}, "does not fit this model: features of 'db/a.png'"),
         (FEATURES, {"descriptors": 9}, r"descriptors of 'db/a.jpg' have the shape \(9, 128\)"),
     ],
 )

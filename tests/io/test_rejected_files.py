@@ -164,8 +164,8 @@ def test_wrong_points_are_named(tmp_path: Path, row: str, message: str) -> None:
     [
         ("5, t, a, 1, b", "expected point3d_id"),
         ("x, t, a, 1", "expected point3d_id"),
-        ("5, t, a, -1", "ids from 0 on"),
-        (f"5, t, a, {2**31}", "ids from 0 on"),
+        ("5, t, a, -1", "with ids of 0 or more"),
+        (f"5, t, a, {2**31}", "with ids of 0 or more"),
         ("5, t/u, a, 1", "cannot be a type name"),
         ("5, t, ../a, 1", "leads out"),
     ],

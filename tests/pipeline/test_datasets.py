@@ -87,7 +87,7 @@ def test_the_root_is_found_below_the_environment(
 def test_unknown_datasets_and_options_are_refused() -> None:
     with pytest.raises(OptionError, match="unknown dataset 'venice'; known: kapture, "):
         choose_dataset("venice", None)
-    with pytest.raises(PluginError, match="refuses its options: unknown option 'colour'"):
+    with pytest.raises(PluginError, match="rejects its options: unknown option 'colour'"):
         choose_dataset("aachen", Path(), import_options={"colour": "red"})
     with pytest.raises(OptionError, match="--query-prefix"):
         choose_dataset("inloc", Path(), query_prefix="q")

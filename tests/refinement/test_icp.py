@@ -189,7 +189,7 @@ def test_movement_and_overlap_are_bounded(furnished: Scene) -> None:
     assert "moved" in refine(furnished, start, IcpOptions(max_moved_m=0.04)).reason
     forced = refine(furnished, start, IcpOptions(max_moved_m=0.04, accept_always=True))
     assert forced.accepted and forced.cam_from_world != start
-    assert "turned" in refine(furnished, start, IcpOptions(max_moved_deg=2.5)).reason
+    assert "rotated" in refine(furnished, start, IcpOptions(max_moved_deg=2.5)).reason
     uncovered = refine(furnished, start, IcpOptions(min_overlap=1.0))
     assert "of the query's points are on the map" in uncovered.reason
     # the true pose does not get worse

@@ -323,7 +323,7 @@ class Aachen:
         remarks: list[str],
         **more: Any,
     ) -> OfficialDataset:
-        truth, _ = read_ground_truth(missing.root, images.query, World())  # names tell conditions
+        truth, _ = read_ground_truth(missing.root, images.query, World())  # names have conditions
         conditions = images.conditions.items()
         return OfficialDataset(
             mapping=images.mapping,

@@ -207,7 +207,7 @@ class RobotCar:
     ) -> OfficialDataset:
         car = with_rig_of_model(car, selection.reference)
         mapping, query = mapping_data(selection, car), with_images(car, selection.query_images)
-        published, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
+        published, _ = read_ground_truth(missing.root, query, World())  # names have conditions
         groups = _image_groups(selection)
         others = "test images" if selection.version == 2 else "other queries"
         truth = (

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-INTERVALS = "95 % confidence intervals of recall, queries taken as independent (%)"
+INTERVALS = "95 % confidence intervals of recall, queries assumed independent (%)"
 CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses (%)"
 # the recall of fewer queries is an example, not a measurement
 FEW = 10
@@ -132,8 +132,8 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
         by_inliers = confidence.area_by_inliers
         than = "" if by_inliers is None else f" ({by_inliers:.4f} if ranked by inliers)"
         sentences.append(
-            f"calibration error {confidence.calibration_error:.3f}; area under risk against "
-            f"coverage {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
+            f"calibration error {confidence.calibration_error:.3f}; area under the "
+            f"risk-coverage curve {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
         )
     if confidence.num_nowhere:
         sentences.append(
@@ -150,8 +150,8 @@ def consistency_sentence(row: ConsistencyRow) -> str:
         return f"{row.method}{frame} is not used: {row.reason}"
     return (
         f"{row.method}{frame} is used; {row.images} map images held out move by "
-        f"{format_movement(row.moved_m, row.turned_deg)}, {row.moved_px:.1f} px (medians; claimed "
-        f"accuracy {format_movement(row.claimed_m, row.claimed_deg)})"
+        f"{format_movement(row.moved_m, row.turned_deg)}, {row.moved_px:.1f} px (medians; "
+        f"estimated accuracy {format_movement(row.claimed_m, row.claimed_deg)})"
     )
 
 
@@ -175,11 +175,11 @@ def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
     only_first, only_second = len(test.only_first), len(test.only_second)
     if not only_first and not only_second:
         if not test.both:
-            return f"{where} neither {first} nor {second} finds a query."
-        return f"{where} {first} and {second} find the same {_queries(test.both)}."
+            return f"{where} neither {first} nor {second} localizes a query."
+        return f"{where} {first} and {second} localize the same {_queries(test.both)}."
     return (
-        f"{where} {first} finds {_queries(only_first)} that {second} misses and {second} finds "
-        f"{only_second or 'none'} that {first} misses: {_verdict(test)}."
+        f"{where} {first} localizes {_queries(only_first)} that {second} misses and {second} "
+        f"localizes {only_second or 'none'} that {first} misses: {_verdict(test)}."
     )
 
 
@@ -213,7 +213,7 @@ def method_sentence(comparison: Comparison) -> str:
     number = len(comparison.tests)
     holm = f", after Holm's correction for {number} tests" if number > 1 else ""
     return (
-        "Exact McNemar test on the same queries, taken as independent, two-sided; real: p at or "
+        "Exact McNemar test on the same queries, assumed independent, two-sided; real: p at or "
         f"below {SIGNIFICANCE:g}{holm}. Intervals of medians: {NUM_RESAMPLES} resamples of the "
         "queries."
     )
@@ -240,7 +240,7 @@ def _signed(metres: float) -> str:
 
 
 def recall_table(evaluations: Sequence[Evaluation]) -> DataFrame:
-    """Return recall and medians, per condition one row for each result."""
+    """Return recall and medians, one row per condition and result."""
     return _frame(
         {
             **label,
@@ -377,7 +377,7 @@ def refinement_table(evaluation: Evaluation) -> DataFrame | None:
             for heading, poses in (("error before", old), ("error after", new)):
                 errors = pose_errors(poses, truth, names)
                 line[heading] = _medians(zip(errors.position_m, errors.angle_deg, strict=True))
-        table.append({**line, "reasons of kept poses": "; ".join(listed)})
+        table.append({**line, "reasons for rejection": "; ".join(listed)})
     return _frame(table) if table else None
 
 

@@ -57,7 +57,7 @@ _STYLE: dict[Any, Any] = {
 @contextmanager
 def _figure(width: float, height: float) -> Iterator[Figure]:
     with matplotlib.rc_context(rc=matplotlib.rcParamsDefault), warnings.catch_warnings():
-        # names may have glyphs that matplotlib's font lacks
+        # names may have characters that matplotlib's font lacks
         warnings.filterwarnings("ignore", message="Glyph")
         matplotlib.rcParams.update(_STYLE)
         figure = Figure(figsize=(width, height))

@@ -64,8 +64,8 @@ def write_report(
 
     The files are recall.json and recall.txt (without truth agreement.json and agreement.txt),
     per_query.csv, report.html, and view.html for a single result. ``map_poses`` are by default
-    those of the first result with a map. ``provenance`` is JSON data, shown at the end of the page,
-    except its ``steps``: a table of the stages near the top.
+    those of the first result with a map. ``provenance`` is JSON data, shown at the end of the page;
+    its ``steps``, a table of the stages, are near the top.
     """
     name = "agreement" if isinstance(reported, WithoutTruth) else "recall"
     view = _view(reported)
@@ -110,7 +110,7 @@ def _facts(reported: Reported) -> list[_Fact]:
     facts.append((f"recall (%) at {content.bounds(thresholds)}\n{criterion}", None))
     facts.append(("", content.recall_table(evaluations)))
     if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
-        text = "the same by the distance between estimated and true camera centres"
+        text = "the same, by the distance between estimated and true camera centres"
         facts.append((text, content.recall_table(by_center)))
     facts.append((content.INTERVALS, content.interval_table(evaluations)))
     for evaluation in evaluations:
@@ -122,7 +122,7 @@ def _facts(reported: Reported) -> list[_Fact]:
             facts.append((f"Confidence{whose}: {'; '.join(sentences)}.", None))
         if (check := evaluation.covariance) is not None:
             errors = content.counted(check["num_poses"], "error lies", "errors lie")
-            sentence = f"{check['num_within']} of {errors} within the claimed 95 % region."
+            sentence = f"{check['num_within']} of {errors} within the estimated 95 % region."
             facts.append((f"Covariance{whose}: {sentence}", None))
     if isinstance(reported, Comparison):
         sentences = content.comparison_sentences(reported)

@@ -114,7 +114,7 @@ def read_observations(path: Path) -> dict[str, Observations]:
         except UnicodeDecodeError as error:
             raise DataError("not a text file in UTF-8") from error
         except (ValueError, OverflowError) as error:
-            message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, ids from 0 on"
+            message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, with ids of 0 or more"
             raise DataError(message) from error
     if not blocks:
         return {}
@@ -246,7 +246,7 @@ def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] |
         return None
     if num_points == 0:
         return np.zeros((0, 6))  # an empty file cannot be mapped
-    with reading(path, "an array of numpy"):
+    with reading(path, "a NumPy array"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     require(
         array.dtype == np.float64 and array.shape == (num_points, 6),

@@ -360,7 +360,7 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, track: Track | Non
     except requests.exceptions.HTTPError as error:
         raise MeglocError(f"{url}: the server answers {error}") from error
     except requests.exceptions.RequestException as error:
-        raise MeglocError(f"{url}: the transfer broke: {error}") from error
+        raise MeglocError(f"{url}: the transfer failed: {error}") from error
     except ValueError as error:  # pooch: wrong sha256
         raise DataError(f"the download is not the published file: {error}", path=url) from error
     except OSError as error:

@@ -101,7 +101,7 @@ def test_text_of_two_results(world: Any) -> None:
     text = report_text(comparison)
     for row in results[1].rows:
         assert " / ".join(f"{100 * at.recall:.1f}" for at in row.recall) in text
-    assert "localized finds 8 queries that fewer misses" in " ".join(text.split())
+    assert "localized localizes 8 queries that fewer misses" in " ".join(text.split())
     # long labels are cut, in the table only
     assert "/data/xxxxxxx...xxx/localized" in text
 
@@ -147,7 +147,7 @@ def test_refinement_before_and_after() -> None:
             "moved by (median)": "0.1500 m, 0.000 deg",
             "error before": "0.2500 m, 0.000 deg",
             "error after": "0.2000 m, 0.000 deg",
-            "reasons of kept poses": "1 x … m apart",
+            "reasons for rejection": "1 x … m apart",
         },
         {
             "step": "rendering",
@@ -156,7 +156,7 @@ def test_refinement_before_and_after() -> None:
             "moved by (median)": "0.1900 m, 0.000 deg",
             "error before": "0.2500 m, 0.000 deg",
             "error after": "0.0600 m, 0.000 deg",
-            "reasons of kept poses": "1 x covers … %",
+            "reasons for rejection": "1 x covers … %",
         },
     ]
 
@@ -172,7 +172,7 @@ day        3        3          33.3 / 66.7 / 66.7 / 100.0  0.1000, 0.000    0.10
 night      2        1          0.0 / 0.0 / 50.0 / 50.0     inf              0.4000, 0.000
 all        5        4          20.0 / 40.0 / 60.0 / 80.0   0.4000, 0.000    0.2500, 0.000
 
-95 % confidence intervals of recall, queries taken as independent (%)
+95 % confidence intervals of recall, queries assumed independent (%)
 condition  0.05 m, 5 deg  0.25 m, 2 deg  0.5 m, 5 deg  5 m, 10 deg
 day        0.8-90.6       9.4-99.2       9.4-99.2      29.2-100.0
 night      0.0-84.2       0.0-84.2       1.3-98.7      1.3-98.7
