@@ -28,9 +28,8 @@ from megloc_twins.frames import (
     write_truth,
 )
 from megloc_twins.indoor_rooms import MODULE_M, Floor, Zone, build_floor, floor_place
-from megloc_twins.model_files import write_transformation
 from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
-from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream
+from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream, write_lines
 from megloc_twins.portable import product, settled
 from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_twins.render import RenderedFrame, render_frames
@@ -115,7 +114,7 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
         for scan in scans:
             after = scan.scan_from_floor.inverse()
             rng = stream(options.seed, "inloc", "before", scan.transformation)
-            write_transformation(root / scan.transformation, _displaced(after, rng), after)
+            _write_transformation(root / scan.transformation, _displaced(after, rng), after)
         write_truth(root, mapping, queries)
         groups = {frame.name: ImageGroup(condition=frame.condition) for frame in queries}
         write_groups(root / GROUND_TRUTH / SIDE_TABLES, groups)
@@ -177,6 +176,15 @@ def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform
     turn = RigidTransform((w, 0.0, 0.0, z), (0.0, 0.0, 0.0))
     x, y, z = (float(v) for v in rng.normal(0, 0.08, 3))
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z)) @ pose @ turn
+
+
+def _write_transformation(path: Path, before: RigidTransform, after: RigidTransform) -> None:
+    """Write both matrices in the published form, each under its heading."""
+    lines = []
+    for heading, pose in (("Before general icp:", before), ("After general icp:", after)):
+        rows = (" ".join(f"{value:13.9f}" for value in row) for row in pose.matrix())
+        lines += [heading, *rows, ""]
+    write_lines(path, lines, last_line_ends=False)
 
 
 def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: RenderedFrame) -> None:

@@ -111,11 +111,6 @@ class ModelTwinOptions(TwinOptions):
     night_exposure: float = Field(
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
     )
-    model_features: bool = Field(
-        default=False,
-        description="build sparse models from SIFT features, with a database, instead of exact "
-        "points",
-    )
 
 
 def shuffled(items: Sequence[Item], seed: int, *labels: str) -> list[Item]:

@@ -28,7 +28,6 @@ from megloc_twins.frames import (
     road_lighting,
     write_truth,
 )
-from megloc_twins.model_files import write_colmap_text, write_nvm
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import (
     ModelTwinOptions,
@@ -40,10 +39,12 @@ from megloc_twins.options import (
 )
 from megloc_twins.portable import settled_pose
 from megloc_twins.sparse_models import (
-    MapFrames,
+    Depths,
+    exact_tracks,
     nvm_model,
     render_map_and_queries,
-    write_sift_database,
+    write_colmap_model,
+    write_nvm,
 )
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit, views_of
@@ -112,23 +113,20 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
     ``./``; the test list omits the conditions; some reference images are in no model and some
     queries in neither list of version 2; lists end with a blank line, have CRLF line breaks or lack
     the last line break.
-    With ``model_features`` also ``3D-models/overcast-reference.db``, the features of the models.
     """
 
     Options = RobotCarTwinOptions
-    version = 2
+    version = 3
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         layout, options = Layout(Path(root)), self.options
         frames = build_robotcar_frames(options)
-        images = layout.images
-        drawn = render_map_and_queries(options, frames.mapping, frames.queries, images, work)
+        depths_m = render_map_and_queries(
+            options, frames.mapping, frames.queries, layout.images, work
+        )
         registered = in_frame(_registered(frames.mapping), OFFICIAL_FROM_WORLD)
         queries = in_frame(frames.queries, OFFICIAL_FROM_WORLD)
-        _write_models(layout, options, registered, drawn)
-        if options.model_features:
-            named = {_png(frame.name): frame for frame in frames.mapping}
-            write_sift_database(layout.feature_database, named, drawn.features)
+        _write_models(layout, options, registered, depths_m)
         _write_car(layout, options)
         _write_query_lists(layout, queries)
         _write_version_2(layout, options, queries)
@@ -282,7 +280,7 @@ def _registered(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def _write_models(
-    layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], drawn: MapFrames
+    layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], depths_m: Depths
 ) -> None:
     """Write one model per location and a merged model, in the same coordinates."""
     places = np.array([frame.place for frame in frames])
@@ -291,8 +289,9 @@ def _write_models(
         positions = np.flatnonzero(places == place).tolist()
         here = [frames[position] for position in positions]
         rng = stream(options.seed, "robotcar", "points", place)
-        points = drawn.points(here, rng)
-        write_colmap_text(layout.individual_model(_location(place)), _colmap_model(here, points))
+        points = exact_tracks(here, depths_m, points_per_frame=options.points_per_image, rng=rng)
+        model = _colmap_model(here, points)
+        write_colmap_model(layout.individual_model(_location(place)), model, text=True)
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))
     names = [f"./{_png(frame.name)}" for frame in frames]
