@@ -41,7 +41,6 @@ Mask = NDArray[np.bool_]
 
 _FRAMES_PER_BATCH = 13  # each batch paints the textures, which takes as long as four frames
 _BONNET_COVERS = 0.5  # covered share of a pixel above which mask and depth exclude it
-_BONNET_TOUCHES = 1e-6  # smallest covered share of a pixel that the bonnet touches
 
 _SHADOW_SIZE = 1024
 _BIAS_M = 0.05  # prevents surfaces from shading themselves
@@ -329,7 +328,10 @@ class PlaceRenderer:
             clouds=self._clouds,
         )
         image = develop(light, frame, self._supersampling, self._seed)
-        mask = _bonnet_cover(frame, self._seed) < _BONNET_COVERS
+        width, height = frame.camera.width, frame.camera.height
+        mask = np.ones((height, width), bool)
+        if frame.bonnet:
+            mask = bonnet(width, height, self._seed)[0] < _BONNET_COVERS
         depth_m = None
         if depth:
             if self._supersampling > 1:
@@ -402,23 +404,3 @@ def _render(
         (frame.name, finish(frame, renderer.render(frame, depth=frame.name in with_depth)))
         for frame in frames
     ]
-
-
-def _bonnet_cover(frame: Frame, seed: int) -> Float32:
-    width, height = frame.camera.width, frame.camera.height
-    if not frame.bonnet:
-        return np.zeros((height, width), np.float32)
-    return bonnet(width, height, seed)[0]
-
-
-def on_bonnet(frame: Frame, seed: int) -> Mask:
-    """Return a mask (H, W) of the pixels that the bonnet of a seed covers at least partly."""
-    return _bonnet_cover(frame, seed) > _BONNET_TOUCHES
-
-
-def on_moving_objects(frame: Frame, place: Place) -> Mask:
-    """Return a mask (H, W) of pixels whose centre shows a person or car; ignores the bonnet."""
-    # surfaces of moving objects follow those of the place
-    surfaces = place.surfaces.joined(moving_object_surfaces(frame.moving_objects))
-    seen = visible_surfaces(surfaces, place.cam_from_place(frame), sample_grid(frame.camera, 1))
-    return seen.surface >= len(place.surfaces)
