@@ -28,8 +28,8 @@ from megloc_twins.frames import (
 )
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import (
-    ModelTwinOptions,
     SyntheticDataset,
+    TwinOptions,
     shuffled,
     stream,
     write_lines,
@@ -64,7 +64,7 @@ _FILES = {  # image names, formatted with hour, minute, second and a running num
 _WRONG_IMAGE = 1228  # not used: db/1228.jpg has a wrong pose in the published model
 
 
-class AachenTwinOptions(ModelTwinOptions):
+class AachenTwinOptions(TwinOptions):
     """Contents of Aachen's twin; ``make eval`` uses the defaults."""
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
@@ -292,7 +292,7 @@ def _write_nvm_model(
 ) -> None:
     """Write v1.0's NVM, which has only focal lengths, and the list of complete cameras."""
     rng = stream(options.seed, "aachen", "points", "1.0")
-    points = exact_tracks(frames, depths_m, points_per_frame=options.points_per_image, rng=rng)
+    points = exact_tracks(frames, depths_m, rng)
     # as if some features observed no point
     points = replace(points, feature_ids=3 * points.feature_ids + 1)
     cameras = {frame.name: frame.camera for frame in frames}
@@ -310,14 +310,13 @@ def _write_colmap_model(
     cameras = {frame.sensor_id: frame.camera for frame in frames}
     camera_ids = dict(zip(cameras, (rng.permutation(len(cameras)) + 1).tolist(), strict=True))
     image_ids = (rng.permutation(2 * len(frames)) + 1).tolist()
-    points = exact_tracks(frames, depths_m, points_per_frame=options.points_per_image, rng=rng)
     model = ColmapModel(
         cameras={camera_ids[sensor]: camera for sensor, camera in cameras.items()},
         images=tuple(
             ColmapImage(image_id, frame.name, camera_ids[frame.sensor_id], frame.cam_from_world)
             for image_id, frame in zip(image_ids, frames, strict=False)
         ),
-        points=points,
+        points=exact_tracks(frames, depths_m, rng),
     )
     write_colmap_model(folder, model, text=False)
 

@@ -75,7 +75,7 @@ def day_lighting(
     )
 
 
-def night_lighting(rng: np.random.Generator, *, exposure: float) -> Lighting:
+def night_lighting(rng: np.random.Generator, *, exposure: float = 1.0) -> Lighting:
     """Return night light: warm lamps, a faint blue sky, a noisy sensor and more blur."""
     return Lighting(
         condition="night",
@@ -135,21 +135,14 @@ WEATHERS: dict[str, Weather] = {
 }
 
 
-def road_lighting(
-    condition: str, rng: np.random.Generator, *, azimuth: float, night_exposure: float = 1.0
-) -> Lighting:
-    """Return the lighting of an image of a traversal.
+def road_lighting(condition: str, rng: np.random.Generator, *, azimuth: float) -> Lighting:
+    """Return the lighting of an image of a traversal in one of the WEATHERS.
 
-    Parameters
-    ----------
-    condition : a name in :data:`WEATHERS`, else KeyError.
-    rng : exposure and white balance vary a little from image to image.
-    azimuth : of the sun, radians, in the place's frame.
-    night_exposure : light that reaches the sensor at night, relative.
+    ``azimuth`` is that of the sun, radians, in the place's frame.
     """
     weather = WEATHERS[condition]
     if weather.elevation_deg is None:
-        lighting = night_lighting(rng, exposure=night_exposure)
+        lighting = night_lighting(rng)
         cast = weather.tint
     else:
         sun = azimuth, float(np.radians(weather.elevation_deg))

@@ -30,9 +30,9 @@ from megloc_twins.frames import (
 )
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import (
-    ModelTwinOptions,
     SyntheticDataset,
     SyntheticWorldOptions,
+    TwinOptions,
     shuffled,
     stream,
     write_lines,
@@ -87,7 +87,7 @@ _STEPS = 997  # number of possible positions of a query along the path
 _UNLISTED_CONDITIONS = ("rain", "night-rain")
 
 
-class RobotCarTwinOptions(ModelTwinOptions):
+class RobotCarTwinOptions(TwinOptions):
     """Contents of RobotCar Seasons' twin; ``make eval`` uses the defaults."""
 
     num_locations: int = Field(default=3, ge=1, description="locations, at least 60 m apart")
@@ -216,9 +216,7 @@ def _moment(
     frames = []
     for camera, intrinsics in car_cameras(options.size_px).items():
         name = f"{condition}/{camera}/{timestamp}.jpg"
-        lighting = road_lighting(
-            condition, rng, azimuth=azimuth, night_exposure=options.night_exposure
-        )
+        lighting = road_lighting(condition, rng, azimuth=azimuth)
         frames.append(
             Frame(
                 name=name,
@@ -289,7 +287,7 @@ def _write_models(
         positions = np.flatnonzero(places == place).tolist()
         here = [frames[position] for position in positions]
         rng = stream(options.seed, "robotcar", "points", place)
-        points = exact_tracks(here, depths_m, points_per_frame=options.points_per_image, rng=rng)
+        points = exact_tracks(here, depths_m, rng)
         model = _colmap_model(here, points)
         write_colmap_model(layout.individual_model(_location(place)), model, text=True)
         own = np.array(positions, np.int32)

@@ -20,7 +20,7 @@ from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 from megloc_twins.frames import Frame
-from megloc_twins.options import JPEG_QUALITY, ModelTwinOptions, write_lines
+from megloc_twins.options import JPEG_QUALITY, TwinOptions, write_lines
 from megloc_twins.rasterization import intrinsics, project, sample_grid
 from megloc_twins.render import RenderedFrame, render_frames
 
@@ -38,7 +38,11 @@ Depths = Mapping[str, Depth]
 
 
 def exact_tracks(
-    frames: Sequence[Frame], depths_m: Depths, *, points_per_frame: int, rng: np.random.Generator
+    frames: Sequence[Frame],
+    depths_m: Depths,
+    rng: np.random.Generator,
+    *,
+    points_per_frame: int = 100,
 ) -> SparsePoints:
     """Create sparse points seen in at least two frames, with exact observations.
 
@@ -132,7 +136,7 @@ def _squared_reach(camera: Camera) -> float:
 
 
 def render_map_and_queries(
-    options: ModelTwinOptions,
+    options: TwinOptions,
     mapping: Sequence[Frame],
     others: Sequence[Frame],
     images: Path,

@@ -36,6 +36,7 @@ _MAX_FURNITURE = 8
 _PLACE_DISTANCE_M = 90.0  # between centres of neighbouring places, before a random shift
 _WALL_TEXELS_PER_M = 100
 _MATERIALS = ("brick", "stone", "plaster")
+_SHARED = 0.6  # of posters, doors and windows, which are equal in all places
 _TEXTURES = {  # width, height in texels; number of shared textures and of those of each place
     "window": (156, 192, 3, 3),
     "door": (132, 270, 2, 3),
@@ -247,7 +248,7 @@ class _TextureStore:
 
     def pick(self, kind: str) -> int:
         width, height, num_shared, num_own = _TEXTURES[kind]
-        shared = self.rng.random() < self.options.repetition
+        shared = self.rng.random() < _SHARED
         owner = "shared" if shared else f"place{self.place}"
         number = int(self.rng.integers(num_shared if shared else num_own))
         seed = seed_of(self.options.seed, owner, kind, number)

@@ -54,7 +54,7 @@ def depths(world: SyntheticWorld) -> Depths:
 
 @pytest.fixture(scope="module")
 def points(frames: list[Frame], depths: Depths) -> SparsePoints:
-    return exact_tracks(frames, depths, points_per_frame=40, rng=rng())
+    return exact_tracks(frames, depths, rng(), points_per_frame=40)
 
 
 def test_colmap_projects_the_points_where_they_are_seen(
@@ -75,7 +75,7 @@ def test_colmap_projects_the_points_where_they_are_seen(
     other_from_world = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0]), np.array([9, 8, 7]))
     back = other_from_world.inverse()
     moved = [replace(frame, cam_from_world=frame.cam_from_world @ back) for frame in frames]
-    there = exact_tracks(moved, depths, points_per_frame=40, rng=rng())
+    there = exact_tracks(moved, depths, rng(), points_per_frame=40)
     np.testing.assert_allclose(there.xyz, other_from_world.apply(points.xyz), atol=1e-9)
 
 
@@ -112,7 +112,7 @@ def test_what_stands_in_front_hides_the_wall() -> None:
     pair = [frame("a", 0.0, camera=PINHOLE), frame("b", 0.0, camera=PINHOLE)]
     hidden = wall()
     hidden[:, :20] = 5.0  # in b, something covers the left half
-    points = exact_tracks(pair, {"a": wall(), "b": hidden}, points_per_frame=1200, rng=rng())
+    points = exact_tracks(pair, {"a": wall(), "b": hidden}, rng(), points_per_frame=1200)
     # nothing at 5 m is seen by a, nothing on the left of the wall by b
     assert (points.xy_px[:, 0] > 20).all()
     np.testing.assert_allclose(points.xyz[:, 1], WALL_M, atol=1e-9)
@@ -127,7 +127,7 @@ def test_nothing_is_seen_without_depth_behind_beside_or_in_another_place() -> No
     nothing, both = {"a": 0 * wall(), "b": 0 * wall()}, {"a": wall(), "b": wall()}
     pairs = (([a, b], nothing), ([a, behind], both), ([a, beside], both))
     for frames, depths in (*pairs, ([a, replace(b, place=1)], both), ([], {})):
-        assert len(exact_tracks(frames, depths, points_per_frame=50, rng=rng())) == 0
+        assert len(exact_tracks(frames, depths, rng(), points_per_frame=50)) == 0
 
 
 def test_strong_distortion_folds_nothing_back_into_the_image() -> None:
@@ -137,4 +137,4 @@ def test_strong_distortion_folds_nothing_back_into_the_image() -> None:
     both = {"a": wall(), "b": wall()}
     x_px = 20.0 + 40.0 * -1.95 * (1 - 0.25 * 1.95**2)
     assert 2 < x_px < 38  # the middle of a's image, as b's formula has it
-    assert len(exact_tracks(pair, both, points_per_frame=1200, rng=rng())) == 0
+    assert len(exact_tracks(pair, both, rng(), points_per_frame=1200)) == 0
