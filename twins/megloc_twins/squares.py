@@ -8,7 +8,7 @@ matching hard.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -229,39 +229,33 @@ class Place:
         """Return the pose of a frame relative to this place."""
         return frame.cam_from_world @ self.place_from_world.inverse()
 
-    def surfaces_in_world(self) -> Surfaces:
-        """Return the surfaces in the world frame."""
-        world_from_place = self.place_from_world.inverse()
-        return self.surfaces.moved(
-            world_from_place.rotation_matrix(), np.array(world_from_place.translation)
-        )
-
 
 @dataclass
 class _TextureStore:
     """Textures of a place by recipe, some of them shared by all places."""
 
-    options: SyntheticWorldOptions
+    seed: int
     place: int
     rng: np.random.Generator
-    recipes: list[TextureRecipe] = field(default_factory=list)
+    recipes: list[TextureRecipe]
 
     def pick(self, kind: str) -> int:
         width, height, num_shared, num_own = _TEXTURES[kind]
         shared = self.rng.random() < _SHARED
         owner = "shared" if shared else f"place{self.place}"
         number = int(self.rng.integers(num_shared if shared else num_own))
-        seed = seed_of(self.options.seed, owner, kind, number)
+        seed = seed_of(self.seed, owner, kind, number)
         return index_of(TextureRecipe(kind, width, height, seed), self.recipes)
 
     def material(self, painter: str, kind: str, size_m: tuple[float, float], label: str) -> int:
-        density = _WALL_TEXELS_PER_M if painter == "wall" else GROUND_TEXELS_PER_M
-        seed = seed_of(self.options.seed, self.place, label)
-        params: dict[str, str | float] = {"material": kind}
-        params["material_seed"] = seed_of(self.options.seed, "material")
+        density = GROUND_TEXELS_PER_M
+        params: list[tuple[str, str | float]] = [("material", kind)]
+        params.append(("material_seed", seed_of(self.seed, "material")))
         if painter == "wall":
-            params["graffiti"] = float(self.rng.integers(0, 3))
-        recipe = TextureRecipe(painter, *texels(size_m, density), seed, tuple(params.items()))
+            density = _WALL_TEXELS_PER_M
+            params.append(("graffiti", float(self.rng.integers(0, 3))))
+        seed = seed_of(self.seed, self.place, label)
+        recipe = TextureRecipe(painter, *texels(size_m, density), seed, tuple(params))
         return index_of(recipe, self.recipes)
 
 
@@ -269,8 +263,8 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
     """Lay out place ``index`` of a world."""
     rng = stream(options.seed, "layout", index)
     plan = draw_floor_plan(rng, index)
-    store = _TextureStore(options, index, stream(options.seed, "textures", index))
-    store.recipes += moving_object_recipes(options.seed)
+    seed, recipes = options.seed, moving_object_recipes(options.seed)
+    store = _TextureStore(seed, index, stream(seed, "textures", index), recipes)
     builder = SurfaceBuilder()
     lamps: list[Vector] = []
     ends = np.roll(plan.outline, -1, axis=0)

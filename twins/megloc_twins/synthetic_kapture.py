@@ -33,7 +33,7 @@ from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, SyntheticWorldOptions, stream
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
-from megloc_twins.viewpoints import CoarseView, coarse_view, query_frames
+from megloc_twins.viewpoints import query_frames
 
 RIG_HEIGHT_M = 1.9
 _RIG_ID = "rig"
@@ -113,17 +113,6 @@ class SyntheticWorld:
     def frames(self) -> tuple[Frame, ...]:
         """Return all images, the map's first."""
         return self.mapping + self.queries
-
-    def coarse_views(self) -> dict[str, CoarseView]:
-        """Return a coarse view of every frame by image name, in the world, without moving objects.
-
-        :func:`overlap` of two views tests whether a query and a map image show the same surfaces.
-        """
-        surfaces = [place.surfaces_in_world() for place in self.places]
-        return {
-            frame.name: coarse_view(surfaces[frame.place], frame.camera, frame.cam_from_world)
-            for frame in self.frames()
-        }
 
 
 def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:

@@ -15,7 +15,7 @@ from megloc_twins.robotcar import RobotCarTwinOptions, build_robotcar_frames
 from megloc_twins.squares import build_place
 from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
-from megloc_twins.viewpoints import overlap
+from megloc_twins.viewpoints import overlap, views_of
 
 from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
 
@@ -92,10 +92,10 @@ def _evenly_lit(frame: Frame) -> Frame:
 
 
 def _overlapping(world: SyntheticWorld) -> tuple[Frame, Frame]:
-    views = world.coarse_views()
     query = first(world, "query/day")
-    best = max(world.mapping, key=lambda m: overlap(views[query.name], views[m.name]))
-    return query, best
+    view, *views = views_of(world.places[0], [query, *world.mapping])
+    shares = [overlap(view, other) for other in views]
+    return query, world.mapping[int(np.argmax(shares))]
 
 
 CAR = RobotCarTwinOptions(num_locations=1, moments_per_condition=2, size_px=128)

@@ -43,11 +43,10 @@ def frames(world: SyntheticWorld) -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def depths(world: SyntheticWorld) -> Depths:
-    surfaces = [place.surfaces_in_world() for place in world.places]
     result = {}
     for frame in world.frames():
-        grid = sample_grid(frame.camera, 1)
-        seen = visible_surfaces(surfaces[frame.place], frame.cam_from_world, grid)
+        place, grid = world.places[frame.place], sample_grid(frame.camera, 1)
+        seen = visible_surfaces(place.surfaces, place.cam_from_place(frame), grid)
         result[frame.name] = depth_map(seen)
     return result
 
