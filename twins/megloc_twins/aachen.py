@@ -68,17 +68,11 @@ class AachenTwinOptions(TwinOptions):
     """Contents of Aachen's twin; ``make eval`` uses the defaults."""
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
-    stations_per_place: int = Field(
-        default=8, ge=3, description="spots in each place where three photographs are taken"
-    )
-    sequence_images: int = Field(
-        default=5, ge=2, description="images of the sequence through each place"
-    )
+    stations_per_place: int = Field(default=8, ge=3, description="spots of three photographs each")
+    sequence_images: int = Field(default=5, ge=2, description="images of a place's sequence")
     day_queries: int = Field(default=24, ge=1, description="query images by day, all places")
     night_queries: int = Field(default=16, ge=1, description="query images at night, all places")
-    additional_night_queries: int = Field(
-        default=8, ge=1, description="query images at night that v1.0 does not have"
-    )
+    additional_night_queries: int = Field(default=8, ge=1, description="that v1.0 lacks")
     width: int = Field(default=640, ge=64, description="image width in px; a portrait's height")
     height: int = Field(default=480, ge=48, description="image height in px")
 
@@ -232,8 +226,7 @@ def _map_frame(
     sun: tuple[float, float],
     rng: np.random.Generator,
 ) -> Frame:
-    """Return a hand-held image at a position (place's frame, metres); ``names`` are those of the
-    image and of its sensor."""
+    """Return a hand-held image at a position; ``names`` are those of image and sensor."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
     return Frame(
         name=names[0],

@@ -40,8 +40,7 @@ _MASONRY: dict[str, tuple[int, int, float, float, float]] = {
 def smooth_noise(
     rng: np.random.Generator, height: int, width: int, *, cell: float, octaves: int = 4
 ) -> Field2D:
-    """Return multi-octave noise of zero mean and unit standard deviation; ``cell`` is the cell size
-    of the coarsest octave, texels."""
+    """Return normalised noise; ``cell`` is the cell size of the coarsest octave, texels."""
     total = np.zeros((height, width), np.float32)
     amplitude = 1.0
     for _ in range(octaves):
@@ -193,8 +192,7 @@ def material_tile(kind: str, seed: int) -> Picture:
 
 
 def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> Picture:
-    """Return a surface (height, width, 3) of the material; ``shift`` moves the tile by rows and
-    columns."""
+    """Return a surface (height, width, 3) of the material, moved by ``shift`` (rows, columns)."""
     tile = np.roll(material_tile(kind, seed), shift, axis=(0, 1))
     repeats = (-(-height // TILE), -(-width // TILE), 1)
     return np.tile(tile, repeats)[:height, :width]

@@ -63,7 +63,6 @@ _EXTRA_EVERY = 8  # after every 8th keyframe, the next frame also has images
 _MARGIN_M = 0.35
 
 Season = Literal["summer", "winter", "dusk"]
-
 _SUN = {"summer": (45.0, 60.0), "winter": (20.0, 30.0), "dusk": (0.0, 5.0)}  # elevation, degrees
 _DUSK_SKY = (0.014, 0.03)
 _DUSK_EXPOSURE = 0.65
@@ -135,15 +134,9 @@ class FourSeasonsTwinOptions(TwinOptions):
     """Contents of 4Seasons' twin."""
 
     num_places: int = Field(default=4, ge=1, description="places on the route")
-    map_keyframes: int = Field(
-        default=12, ge=3, description="keyframes of the map recording in each place"
-    )
-    winter_keyframes: int = Field(
-        default=6, ge=1, description="keyframes of the winter recording in each place"
-    )
-    dusk_keyframes: int = Field(
-        default=4, ge=1, description="keyframes of the dusk recording in each place"
-    )
+    map_keyframes: int = Field(default=12, ge=3, description="map keyframes per place")
+    winter_keyframes: int = Field(default=6, ge=1, description="winter keyframes per place")
+    dusk_keyframes: int = Field(default=4, ge=1, description="dusk keyframes per place")
     width: int = Field(default=800, ge=64, description="image width in px")
     height: int = Field(default=400, ge=48, description="image height in px")
 
@@ -292,8 +285,7 @@ def _free_offset(plan: FloorPlan, along: float, most: float, rng: np.random.Gene
 
 
 def _beside(plan: FloorPlan, along: float, offset: float) -> tuple[NDArray[np.float64], float]:
-    """Return position (2,) and direction (radians) of a car at a distance along the path,
-    ``offset`` metres to its left."""
+    """Return position (2,) and direction (radians) of a car ``offset`` metres left of the path."""
     (ahead, behind, spot), _ = plan.on_path([along + _LOOK_AHEAD_M, along - 0.5, along])
     heading = float(np.arctan2(*(ahead - behind)[::-1]))
     return spot + offset * np.array([-np.sin(heading), np.cos(heading)]), heading
@@ -331,18 +323,12 @@ def _write_grey(root: Path, frame: Frame, view: RenderedFrame) -> None:
 
 @dataclass(frozen=True)
 class SlamFrames:
-    """Transforms between a recording's coordinate frames, as in its files.
-
-    Parameters
-    ----------
-    s_from_as, w_from_gpsw, e_from_gpsw : named as in ``Transformations.txt``.
-    scale : metres per unit of the SLAM world.
-    """
+    """Transforms between a recording's coordinate frames, named as in ``Transformations.txt``."""
 
     s_from_as: RigidTransform
     w_from_gpsw: RigidTransform
     e_from_gpsw: RigidTransform
-    scale: float
+    scale: float  # metres per unit of the SLAM world
 
     @classmethod
     def drawn(cls, seed: int, recording: str) -> SlamFrames:
@@ -360,8 +346,7 @@ class SlamFrames:
         )
 
     def slam_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
-        """Return a pose in the convention of ``GNSSPoses.txt``, translation in units of the SLAM
-        world."""
+        """Return a pose as in ``GNSSPoses.txt``, translation in units of the SLAM world."""
         s_from_world = self.w_from_gpsw @ self.e_from_gpsw.inverse() @ EARTH_FROM_WORLD
         metric = self.s_from_as.inverse() @ s_from_world @ cam_from_world.inverse()
         x, y, z = (value / self.scale for value in metric.translation)
@@ -380,7 +365,7 @@ def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
         ("transform_gps_imu", RigidTransform.identity()),
         ("transform_e_gpsw", slam.e_from_gpsw),
     ):
-        lines += [f"# {name}: {_TAGS}", _pose_fields(transform, ",", 6), *[""] * blank_lines]
+        lines += [f"# {name}: {_TAGS}", _pose_fields(transform, 6), *[""] * blank_lines]
     return [*lines, "# GNSS scale", f"{slam.scale:.6f}"]
 
 
@@ -391,7 +376,7 @@ def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
         "fusion_quality, v3"
     ]
     for moment in keyframes:
-        pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), ",", 12)
+        pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), 12)
         lines.append(f"{moment.timestamp},{pose},{slam.scale:.6f},2")
     return lines
 
@@ -420,8 +405,7 @@ def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]
 def _random_transform(
     rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
 ) -> RigidTransform:
-    """Draw a translation, and a rotation by up to ``yaw`` about z and ``tilt`` about x and y,
-    radians."""
+    """Draw a translation, and a rotation by ``yaw`` about z and ``tilt`` about x and y at most."""
     ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
     cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
     sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()
@@ -442,7 +426,7 @@ def _as_written(transform: RigidTransform) -> RigidTransform:
     return RigidTransform((w, x, y, z), (tx, ty, tz))
 
 
-def _pose_fields(pose: RigidTransform, separator: str, decimals: int) -> str:
+def _pose_fields(pose: RigidTransform, decimals: int) -> str:
     """Format translation, then rotation x y z w."""
     w, x, y, z = pose.quat_wxyz
-    return separator.join(f"{value:.{decimals}f}" for value in (*pose.translation, x, y, z, w))
+    return ",".join(f"{value:.{decimals}f}" for value in (*pose.translation, x, y, z, w))

@@ -65,8 +65,7 @@ class Recipes:
         return index_of(TextureRecipe(painter, *_SIZES[painter], number), self.items)
 
     def material(self, kind: str, size_m: tuple[float, float], *label: str | int) -> int:
-        """Return a texture of a wall, floor or ceiling; equal labels and sizes give equal
-        textures."""
+        """Return a texture of a wall, floor or ceiling, equal for equal labels and sizes."""
         number = seed_of(self.seed, "indoor", kind, *label)
         material_seed = seed_of(self.seed, "indoor", label[0])
         params = (("material", kind), ("material_seed", material_seed), ("dirt", _DIRT))
@@ -119,8 +118,7 @@ class Parts:
         size: tuple[float, float] = _POSTER_M,
         painter: str = "poster",
     ) -> None:
-        """Add a flat object to a wall; ``at`` is its lower left corner, along the wall and above
-        the floor."""
+        """Add a flat object to a wall; ``at`` is its lower left corner."""
         span, height = (at[0], at[0] + size[0]), (at[1], at[1] + size[1])
         texture = self.recipes.thing(painter, *label)
         builder = self.own if own else self.shared
@@ -197,8 +195,7 @@ _ORDER = (0, 3, 1, 2)  # of the walls, for numbering their posters
 
 
 def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
-    """Build a room of a kind in its frame, x and y from 0 to ROOM_M; ``owner`` is the label of its
-    individual objects."""
+    """Build a room, x and y from 0 to ROOM_M; ``owner`` labels its individual objects."""
     parts, built = Parts(recipes, (0.0, 0.0), ROOM_M), _KINDS[kind]
     width, depth = ROOM_M
     parts.floor_and_ceiling(kind)

@@ -68,17 +68,13 @@ ScanViews = tuple[Floats, list[CoarseView]]
 class InLocTwinOptions(TwinOptions):
     """Contents of InLoc's twin; ``make eval`` uses the defaults."""
 
-    modules: int = Field(
-        default=2, ge=1, le=20, description="corridor sections per floor, each with two rooms"
-    )
+    modules: int = Field(default=2, ge=1, le=20, description="corridor sections with two rooms")
     queries: int = Field(default=48, ge=2, description="query images, both floors")
     cutout_width: int = Field(default=400, ge=40, description="width of cutouts in px")
     cutout_height: int = Field(default=300, ge=30, description="height of cutouts in px")
     query_width: int = Field(default=640, ge=64, description="width of landscape queries in px")
     query_height: int = Field(default=480, ge=48, description="height of landscape queries in px")
-    supersampling: int = Field(
-        default=2, ge=1, le=4, description="samples per pixel and axis of queries; cutouts have one"
-    )
+    supersampling: int = Field(default=2, ge=1, le=4, description="samples per axis; cutouts: 1")
 
     def floors(self) -> list[Floor]:
         """Return the floors of the building."""
@@ -211,8 +207,7 @@ def scanned_points(
     image: NDArray[np.uint8],
     rng: np.random.Generator,
 ) -> Floats:
-    """Return the scanned point of each pixel of a cutout, float64 (H, W, 3), metres in the scan's
-    frame.
+    """Return the scanned point of each pixel of a cutout, (H, W, 3), metres in the scan's frame.
 
     Pixels without a return are NaN: on glass, where ``image``, uint8 (H, W, 3), is dark, far away,
     at grazing angles and at random. The noise is a millimetre along the beam. Values are rounded to
@@ -299,8 +294,7 @@ def _query_poses(
     scans: Sequence[Sequence[ScanViews]],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, tuple[RigidTransform, float]]]:
-    """Yield misfit, pose and yaw of random poses in a zone of floor ``index``; most poses with a
-    larger misfit than an earlier pose are skipped."""
+    """Yield misfit, pose and yaw of random poses in a zone; worse ones are mostly skipped."""
     floor, plan = floors[index], zone.plan
     copies = list(_copies(floors, index, zone))
     least = np.inf
@@ -333,8 +327,7 @@ def _query_poses(
 def _copies(
     floors: Sequence[Floor], index: int, zone: Zone
 ) -> Iterator[tuple[int, RigidTransform]]:
-    """Yield floor and transform from the zone to each other zone of its kind; for corridors also
-    rotated by 180 degrees."""
+    """Yield floor and transform to each zone of the kind; for corridors also a half turn."""
     half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (MODULE_M, 0.0, 0.0))
     for other_index, floor in enumerate(floors):
         for other in floor.zones:

@@ -79,8 +79,7 @@ class FloorPlan:
         return float(np.hypot(*(np.roll(self.path, -1, axis=0) - self.path).T).sum())
 
     def on_path(self, distance_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Return positions (..., 2) at distances (...) along the path, and the headings
-        (radians)."""
+        """Return positions (..., 2) and headings (radians) at distances (...) along the path."""
         along = np.roll(self.path, -1, axis=0) - self.path
         lengths = np.hypot(*along.T)
         ends = np.cumsum(lengths)
@@ -135,8 +134,7 @@ class MovingObject:
 
 
 def moving_object_recipes(seed: int) -> list[TextureRecipe]:
-    """Return the textures of all moving objects; they are first in every place, so their indices
-    are equal."""
+    """Return the textures of all moving objects, which are the first of every place."""
     number = seed_of(seed, "movers")
     recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
     for i in range(NUM_CARS):

@@ -41,16 +41,12 @@ class SyntheticWorldOptions(TwinOptions):
     """
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
-    stations_per_place: int = Field(
-        default=9, ge=3, description="stops of the mapping rig in each place"
-    )
+    stations_per_place: int = Field(default=9, ge=3, description="stops of the mapping rig")
     day_queries: int = Field(default=24, ge=0, description="query images by day, all places")
     night_queries: int = Field(default=24, ge=0, description="query images at night, all places")
     width: int = Field(default=640, ge=64, description="image width in px")
     height: int = Field(default=480, ge=48, description="image height in px")
-    moving_objects: int = Field(
-        default=2, ge=0, description="people and cars around each rig stop and query"
-    )
+    moving_objects: int = Field(default=2, ge=0, description="people and cars near a camera")
     depth: bool = Field(default=False, description="write depth maps of the mapping images")
     masks: bool = Field(default=False, description="write masks of the bonnet")
 

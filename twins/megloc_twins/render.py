@@ -244,8 +244,7 @@ class PlaceRenderer:
         return RenderedFrame(image, depth_m, mask)
 
     def _static_shadows(self, sun: Triple) -> ShadowMap:
-        """Return the shadow map of the static surfaces; the last one is cached, because consecutive
-        frames often have the same sun."""
+        # consecutive frames often have the same sun
         if self._shadows is None or self._shadows[0] != sun:
             self._shadows = (sun, cast_shadows(self._place.surfaces, sun))
         return self._shadows[1]
@@ -302,8 +301,7 @@ class PlaceRenderer:
 
 
 def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
-    """Return x, y, z of each sample's surface point in the place's frame, metres; those of the
-    camera without a surface."""
+    """Return x, y, z of each sample's surface point, or of the camera, in the place's frame."""
     rotation = cam_from_place.rotation_matrix().astype(np.float32)
     center = cam_from_place.center().astype(np.float32)
     hit = seen.inverse_depth > 0

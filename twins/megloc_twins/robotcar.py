@@ -91,12 +91,8 @@ class RobotCarTwinOptions(TwinOptions):
     """Contents of RobotCar Seasons' twin; ``make eval`` uses the defaults."""
 
     num_locations: int = Field(default=3, ge=1, description="locations, at least 60 m apart")
-    stops_per_location: int = Field(
-        default=12, ge=3, description="moments of the reference traversal in each location"
-    )
-    moments_per_condition: int = Field(
-        default=8, ge=2, description="moments of each other traversal, all locations"
-    )
+    stops_per_location: int = Field(default=12, ge=3, description="moments of the map in each")
+    moments_per_condition: int = Field(default=8, ge=2, description="of each other traversal")
     size_px: int = Field(default=512, ge=64, description="width and height of an image")
 
     def world(self) -> SyntheticWorldOptions:
@@ -242,8 +238,7 @@ def _query_poses(
     map_views: list[CoarseView],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, RigidTransform]]:
-    """Yield ``car_from_place`` near the reference traversal, preceded by the misfit of the scored
-    camera's view."""
+    """Yield the misfit of the scored camera's view and ``car_from_place``, near the map's path."""
     camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], CAM_FROM_CAR[SCORED_CAMERA]
     path = place.plan.stops(_STEPS)
     for _ in range(_ATTEMPTS):
@@ -260,8 +255,7 @@ def _query_poses(
 def _car_from_place(
     spot: NDArray[np.float64], yaw: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """Return the pose of a slightly tilted car at a position (2,), metres, driving along
-    ``yaw``."""
+    """Return the pose of a slightly tilted car at a position (2,) that drives along ``yaw``."""
     pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
     height = _CAMERA_HEIGHT_M + float(rng.normal(0, 0.02))
     return looking_at(np.array([*spot, height]), float(yaw), pitch, roll)
@@ -339,8 +333,7 @@ def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
 def _write_version_2(
     layout: Layout, options: RobotCarTwinOptions, queries: Sequence[Frame]
 ) -> None:
-    """Write version 2's lists: half of each traversal's moments with poses, half without; a few
-    moments are in neither list."""
+    """Write version 2's lists: half of each traversal's moments have poses, a few are missing."""
     train: list[Frame] = []
     test: list[Frame] = []
     scored = [frame for frame in queries if frame.sensor_id == SCORED_CAMERA]

@@ -47,21 +47,9 @@ def exact_tracks(
     """Create sparse points seen in at least two frames, with exact observations.
 
     Pixels with depth are drawn at random in every frame, lifted to world points and projected into
-    all frames of the same place whose depth agrees.
-
-    Parameters
-    ----------
-    frames : PINHOLE, SIMPLE_PINHOLE or SIMPLE_RADIAL cameras.
-    depths_m : float32 (H, W) along the optical axis by image name, one for each frame, 0 without a
-        surface.
-    points_per_frame : number of pixels drawn in each frame; a pixel that no other frame sees gives
-        no point.
-
-    Returns
-    -------
-    Grey points with ``xyz`` in the world of the poses and observations sorted by point, then image.
-    ``image_ids`` index ``frames``, ``feature_ids`` count from 0 in each image, ``xy_px`` are the
-    projections rounded to float32.
+    all frames of the same place whose depth agrees. Depth, float32 (H, W) by image name, is 0
+    without a surface. Observations are sorted by point, then image; ``feature_ids`` count from 0 in
+    each image.
     """
     parts = [SparsePoints.none()]
     for frame in frames:

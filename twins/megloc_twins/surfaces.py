@@ -96,9 +96,10 @@ class SurfaceBuilder:
         uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
-        """Add an upright box: ``size`` is (along x, along y, height) in metres before the rotation
-        by ``yaw`` (radians); ``sides`` are the textures of the -y, +x, +y and -x faces, each
-        showing the part ``uv``."""
+        """Add an upright box of size (along x, along y, height), rotated by ``yaw``.
+
+        ``sides`` are the textures of the -y, +x, +y and -x faces, each showing the part ``uv``.
+        """
         half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
         cos, sin = np.cos(yaw), np.sin(yaw)
         along = np.array([cos, sin, 0.0])

@@ -38,8 +38,6 @@ from megloc_twins.viewpoints import query_frames
 RIG_HEIGHT_M = 1.9
 _RIG_ID = "rig"
 _BONNET_SENSOR = "rig_front"
-
-
 # rig axes: x right, y down, z forward; metres
 SENSOR_FROM_RIG = {
     "rig_front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),

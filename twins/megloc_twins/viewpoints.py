@@ -143,8 +143,7 @@ def query_frames(
     condition: Condition,
     total: int,
 ) -> list[Frame]:
-    """Choose the queries of a condition in one place, out of ``total`` in all places; ``mapping``
-    are the map images."""
+    """Choose the queries of a condition in one place, out of ``total`` in all places."""
     map_views = views_of(place, mapping)
     frames = []
     for number in range(place.index, total, options.num_places):
