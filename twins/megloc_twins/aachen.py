@@ -27,13 +27,7 @@ from megloc_twins.frames import (
     write_truth,
 )
 from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import (
-    SyntheticDataset,
-    TwinOptions,
-    shuffled,
-    stream,
-    write_lines,
-)
+from megloc_twins.options import SyntheticDataset, TwinOptions, shuffled, stream, write_lines
 from megloc_twins.portable import settled_pose
 from megloc_twins.sparse_models import (
     Depths,

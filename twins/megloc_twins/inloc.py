@@ -20,13 +20,7 @@ from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import (
-    Frame,
-    lamp_lighting,
-    looking_at,
-    noise_seed,
-    write_truth,
-)
+from megloc_twins.frames import Frame, lamp_lighting, looking_at, noise_seed, write_truth
 from megloc_twins.indoor_rooms import MODULE_M, Floor, Zone, build_floor, floor_place
 from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream, write_lines

@@ -69,12 +69,7 @@ def paint_wall(
 
 
 def paint_ground(
-    rng: Generator,
-    height: int,
-    width: int,
-    *,
-    material: str,
-    material_seed: float,
+    rng: Generator, height: int, width: int, *, material: str, material_seed: float
 ) -> Rgb:
     """Paint paving or asphalt with patches, lines, manholes and leaves."""
     density = GROUND_TEXELS_PER_M

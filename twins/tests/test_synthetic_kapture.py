@@ -7,11 +7,7 @@ from pathlib import Path
 import numpy as np
 from kapture.io.csv import kapture_from_dir
 from megloc_twins.options import SyntheticWorldOptions
-from megloc_twins.synthetic_kapture import (
-    SyntheticWorld,
-    build_world,
-    depth_name,
-)
+from megloc_twins.synthetic_kapture import SyntheticWorld, build_world, depth_name
 from megloc_twins.viewpoints import overlap, support, views_of
 
 from megloc_kapture.io.dataset_tables import read_groups, read_protocol, read_world
