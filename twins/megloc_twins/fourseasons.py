@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,8 +70,6 @@ _DUSK_EXPOSURE = 0.65
 _EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
 _GREY = np.array([299, 587, 114])  # weights of R, G and B, thousandths
 
-_TAGS = "translation vector, rotation quaternion"
-
 
 def _settled_earth_from_enu(
     latitude_deg: float, longitude_deg: float, height_m: float
@@ -108,19 +106,6 @@ class Drive:
     role: Role  # of its images
     lateral_m: float  # largest lateral deviation from the path
     turn_deg: float  # largest deviation from the path's direction
-
-    @property
-    def start_ns(self) -> int:
-        """Return the time of the first frame."""
-        moment = datetime.strptime(self.name, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
-        return int(moment.timestamp()) * 10**9
-
-    def sky_seed(self, seed: int) -> int:
-        """Return the seed of clouds and of dirt on the bonnet, which differs by season.
-
-        If map and queries had the same dirt, the bonnet would yield the best matches.
-        """
-        return seed + (get_args(Season).index(self.season) << 32)
 
 
 def stereo_camera(width: int, height: int) -> Camera:
@@ -188,7 +173,8 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
     """Return the moments of a drive through all places, in order of time."""
     rng = stream(options.seed, "drive", drive.name)
     moments = []
-    clock = drive.start_ns
+    start = datetime.strptime(drive.name, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
+    clock = int(start.timestamp()) * 10**9
     for index in range(options.num_places):
         place = build_place(options, index)
         sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[drive.season])))
@@ -295,20 +281,20 @@ def _write_recording(
     root: Path, options: FourSeasonsTwinOptions, drive: Drive, moments: list[Moment], work: Work
 ) -> None:
     folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
-    published = drive.name != DUSK  # poses of test recordings are withheld
     keyframes = [moment for moment in moments if moment.keyframe]
     render_frames(
         options.world(),
         [frame for moment in moments for frame in moment.frames],
         partial(_write_grey, root),
         build=winter_place if drive.season == "winter" else build_place,
-        sky_seed=drive.sky_seed(options.seed),
+        # with the same dirt as in the map, the bonnet would yield the best matches of queries
+        sky_seed=options.seed + (list(_SUN).index(drive.season) << 32),
         work=work,
     )
     times = (moment.timestamp for moment in moments)  # most have no images
     rows = [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
     write_lines(folder / "times.txt", rows)
-    if not published:
+    if drive.name == DUSK:  # poses of test recordings are withheld
         return
     slam = SlamFrames.drawn(options.seed, drive.name)
     write_lines(folder / "GNSSPoses.txt", _gnss_lines(slam, keyframes))
@@ -365,7 +351,8 @@ def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
         ("transform_gps_imu", RigidTransform.identity()),
         ("transform_e_gpsw", slam.e_from_gpsw),
     ):
-        lines += [f"# {name}: {_TAGS}", _pose_fields(transform, 6), *[""] * blank_lines]
+        heading = f"# {name}: translation vector, rotation quaternion"
+        lines += [heading, _pose_fields(transform, 6), *[""] * blank_lines]
     return [*lines, "# GNSS scale", f"{slam.scale:.6f}"]
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path, PurePosixPath
@@ -86,13 +86,14 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         root, options = Path(root), self.options
-        scans = [
-            _Scan(index, f"{number:03d}", zone.scan_from_place @ floor.place.place_from_world)
-            for index, floor in enumerate(options.floors())
-            for number, zone in enumerate(floor.zones)
-        ]
-        mapping = [frame for scan in scans for frame in _cutouts(options, scan)]
-        queries = build_queries(options)
+        mapping, queries = [], build_queries(options)
+        for index, floor in enumerate(options.floors()):
+            for number, zone in enumerate(floor.zones):
+                scan_from_floor = zone.scan_from_place @ floor.place.place_from_world
+                mapping += _cutouts(options, index, number, scan_from_floor)
+                name, after = _transformation(index, number), scan_from_floor.inverse()
+                before = _displaced(after, stream(options.seed, "inloc", "before", name))
+                _write_transformation(root / name, before, after)
         for frames, samples in ((mapping, 1), (queries, options.supersampling)):
             render_frames(
                 options.world().model_copy(update={"supersampling": samples}),
@@ -101,61 +102,47 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
                 build=partial(floor_place, options.modules),
                 work=work,
             )
-        for scan in scans:
-            after = scan.scan_from_floor.inverse()
-            rng = stream(options.seed, "inloc", "before", scan.transformation)
-            _write_transformation(root / scan.transformation, _displaced(after, rng), after)
         write_truth(root, mapping, queries)
         groups = {frame.name: ImageGroup(condition=frame.condition) for frame in queries}
         write_groups(root / GROUND_TRUTH / SIDE_TABLES, groups)
         return {
             "floors": len(_FLOORS),
-            "scans": len(scans),
+            "scans": len(mapping) // (len(YAWS_DEG) * len(PITCHES_DEG)),
             "mapping images": len(mapping),
             "query images": len(queries),
         }
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """A scan of the twin: file names and pose."""
-
-    floor: int
-    number: str
-    scan_from_floor: RigidTransform
-
-    @property
-    def transformation(self) -> str:
-        folder = f"database/alignments/{_FLOORS[self.floor]}/transformations"
-        return f"{folder}/{_BUILDING}_trans_{self.number}.txt"
-
-    def image(self, yaw_deg: int, pitch_deg: int) -> str:
-        name = f"{_BUILDING}_cutout_{self.number}_{yaw_deg}_{pitch_deg}.jpg"
-        return f"database/cutouts/{_FLOORS[self.floor]}/{self.number}/{name}"
+def _transformation(floor: int, number: int) -> str:
+    """Return the path of a scan's transformation."""
+    folder = f"database/alignments/{_FLOORS[floor]}/transformations"
+    return f"{folder}/{_BUILDING}_trans_{number:03d}.txt"
 
 
-def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
+def _cutouts(
+    options: InLocTwinOptions, floor: int, number: int, scan_from_floor: RigidTransform
+) -> list[Frame]:
     frames: list[Frame] = []
     camera = cutout_camera(options.cutout_width, options.cutout_height)
-    for yaw in YAWS_DEG:
-        for pitch in PITCHES_DEG:
-            name = scan.image(yaw, pitch)
-            # a panorama has a single exposure
-            rng = stream(options.seed, "inloc", "light", scan.transformation)
-            frames.append(
-                Frame(
-                    name=name,
-                    role="mapping",
-                    condition=_FLOORS[scan.floor],
-                    place=scan.floor,
-                    timestamp=len(frames) + 1000 * int(scan.number) + 1_000_000 * scan.floor,
-                    sensor_id="cutout",
-                    camera=camera,
-                    cam_from_world=cam_from_scan(yaw, pitch) @ scan.scan_from_floor,
-                    lighting=lamp_lighting(rng, noise=1.0),
-                    noise_seed=noise_seed(options.seed, name),
-                )
+    folder = f"database/cutouts/{_FLOORS[floor]}/{number:03d}"
+    for yaw, pitch in itertools.product(YAWS_DEG, PITCHES_DEG):
+        name = f"{folder}/{_BUILDING}_cutout_{number:03d}_{yaw}_{pitch}.jpg"
+        # a panorama has a single exposure
+        rng = stream(options.seed, "inloc", "light", _transformation(floor, number))
+        frames.append(
+            Frame(
+                name=name,
+                role="mapping",
+                condition=_FLOORS[floor],
+                place=floor,
+                timestamp=len(frames) + 1000 * number + 1_000_000 * floor,
+                sensor_id="cutout",
+                camera=camera,
+                cam_from_world=cam_from_scan(yaw, pitch) @ scan_from_floor,
+                lighting=lamp_lighting(rng, noise=1.0),
+                noise_seed=noise_seed(options.seed, name),
             )
+        )
     return frames
 
 

@@ -62,10 +62,7 @@ def seed_of(seed: int, *labels: str | int) -> int:
 
 
 class SyntheticDataset(ABC, Generic[OptionsT]):
-    """A dataset rendered from its options; group ``megloc_kapture.rendered_datasets``.
-
-    ``options`` have the class's type ``Options``; None means the defaults.
-    """
+    """A dataset rendered from its options; group ``megloc_kapture.rendered_datasets``."""
 
     Options: ClassVar[type[Options]]
     version: ClassVar[int]  # of the files; increase it when equal options give different files

@@ -50,7 +50,6 @@ from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit, views_of
 
 REFERENCE_CONDITION = "overcast-reference"
-CONDITIONS = ("dawn", "overcast-winter", "rain", "sun", "night", "night-rain")
 CAMERAS = ("left", "rear", "right")
 SCORED_CAMERA = "rear"  # also shows the car's boot
 
@@ -61,7 +60,7 @@ OFFICIAL_FROM_WORLD = settled_pose(
 )
 # time of the first image of each traversal, microseconds
 _STARTS_US = {
-    "overcast-reference": 1417176458999821,
+    REFERENCE_CONDITION: 1417176458999821,
     "dawn": 1418721355075498,
     "overcast-winter": 1423840721124367,
     "rain": 1416908241836249,
@@ -69,6 +68,7 @@ _STARTS_US = {
     "night": 1418235223450115,
     "night-rain": 1418840689734892,
 }
+CONDITIONS = tuple(_STARTS_US)[1:]  # of the queries
 _PLACE_US, _STOP_US = 60_000_000, 1_062_501
 _CAMERA_HEIGHT_M = 1.6
 # viewing directions of the cameras, degrees to the right of straight ahead and upwards, and their
