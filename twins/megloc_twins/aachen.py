@@ -101,7 +101,7 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
             [replace(frame, timestamp=time) for time, frame in enumerate(some)]
             for some in (mapping, queries)
         )
-        write_truth(root, *timed, named=False)
+        write_truth(root, *timed)
         return {
             "places": options.num_places,
             "mapping images": len(mapping),

@@ -233,15 +233,12 @@ def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> li
     ]
 
 
-def kapture_records(
-    frames: Iterable[Frame], *, poses: bool = True, named: bool = True
-) -> KaptureData:
-    """Return sensors, records and poses of the frames; ``named`` gives sensors their id as name."""
+def kapture_records(frames: Iterable[Frame], *, poses: bool = True) -> KaptureData:
+    """Return sensors, records and, on request, poses of the frames."""
     data = KaptureData()
     for frame in frames:
         record = frame.timestamp, frame.sensor_id
-        name = frame.sensor_id if named else ""
-        data.sensors[frame.sensor_id] = Sensor.from_camera(frame.camera, name=name)
+        data.sensors[frame.sensor_id] = Sensor.from_camera(frame.camera, name=frame.sensor_id)
         data.records_camera[record] = frame.name
         if poses:
             data.trajectories[record] = frame.cam_from_world
@@ -253,11 +250,10 @@ def write_truth(
     mapping: Iterable[Frame],
     queries: Iterable[Frame],
     *,
-    named: bool = True,
     rigs: Mapping[str, dict[str, RigidTransform]] | None = None,
 ) -> None:
-    """Write the true poses of all images as kapture below ``root``; raises OutputError."""
+    """Write the true poses of all images as kapture below ``root``."""
     for role, frames in (("mapping", mapping), ("query", queries)):
-        data = kapture_records(frames, named=named)
+        data = kapture_records(frames)
         data.rigs.update(rigs or {})
         write_sensors(root / GROUND_TRUTH / role, data)
