@@ -120,11 +120,9 @@ class AachenFrames:
     unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
 
     def mapping(self) -> tuple[Frame, ...]:
-        """Return all map images."""
         return self.database + self.sequences
 
     def queries(self) -> tuple[Frame, ...]:
-        """Return all listed queries."""
         return self.day + self.night
 
 

@@ -84,7 +84,6 @@ def to_rgb(image: Picture) -> Rgb:
 
 
 def shade(image: Picture, factor: Field2D) -> Picture:
-    """Multiply a picture by a field (H, W)."""
     return image * factor[..., None]
 
 
@@ -154,7 +153,6 @@ def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
 
 
 def _blocks(rng: np.random.Generator, base: Colour, kind: str) -> Picture:
-    """Draw a tile of masonry blocks."""
     rows, cols, spread, joint, joint_grey = _MASONRY[kind]
     y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
     v = (y + 0.5) / TILE * rows

@@ -126,7 +126,6 @@ class FourSeasonsTwinOptions(TwinOptions):
     height: int = Field(default=400, ge=48, description="image height in px")
 
     def drives(self) -> tuple[Drive, Drive, Drive]:
-        """Return the recordings, the map's first."""
         return (
             Drive(REFERENCE, "summer", self.map_keyframes, "mapping", 0.1, 2),
             Drive(WINTER, "winter", self.winter_keyframes, "query", 0.6, 8),
@@ -318,7 +317,6 @@ class SlamFrames:
 
     @classmethod
     def drawn(cls, seed: int, recording: str) -> SlamFrames:
-        """Draw the coordinate frames of a recording."""
         rng = stream(seed, "frames", recording)
         # the scenes of different recordings have origins some hundred metres apart
         east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
@@ -369,7 +367,6 @@ def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
 
 
 def _write_calibration(folder: Path, camera: Camera) -> None:
-    """Write the calibration files of undistorted images."""
     params = " ".join(map(repr, camera.params))
     size = f"{camera.width} {camera.height}"
     for number in (0, 1):
@@ -406,7 +403,6 @@ def _random_transform(
 
 
 def _as_written(transform: RigidTransform) -> RigidTransform:
-    """Round a transform to six decimals."""
     quat = np.round(transform.quat_wxyz, 6)
     w, x, y, z = (quat / np.sqrt((quat * quat).sum())).tolist()
     tx, ty, tz = np.round(transform.translation, 6).tolist()

@@ -96,7 +96,6 @@ class Parts:
         return Wall.between(self.shared, ends, texture, trim, _HEIGHT_M)
 
     def lamp(self, x: float, y: float) -> None:
-        """Add a lamp under the ceiling."""
         glow, plain = self.recipes.thing("glow", "lamp"), self.recipes.thing("plain", "lamp")
         low = _HEIGHT_M - 0.08
         self.shared.add_box(
@@ -105,7 +104,6 @@ class Parts:
         self.lamps.append(np.array([x, y, low - 0.1]))
 
     def floor_and_ceiling(self, kind: str) -> None:
-        """Add floor and ceiling."""
         low, high = self.low, self.high
         size_m = high[0] - low[0], high[1] - low[1]
         along, across = np.array([size_m[0], 0.0, 0.0]), np.array([0.0, size_m[1], 0.0])
@@ -385,7 +383,6 @@ def _official_frame(seed: int, index: int) -> RigidTransform:
 def _zone(
     seed: int, index: int, name: str, kind: str, parts: Parts, place_from_part: RigidTransform
 ) -> Zone:
-    """Return the zone of a part of floor ``index``."""
     (x0, y0), (x1, y1) = parts.low, parts.high
     corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
     outline = place_from_part.apply(np.column_stack([corners, np.zeros(4)]))[:, :2]

@@ -71,7 +71,6 @@ class InLocTwinOptions(TwinOptions):
     supersampling: int = Field(default=2, ge=1, le=4, description="samples per axis; cutouts: 1")
 
     def floors(self) -> list[Floor]:
-        """Return the floors of the building."""
         return [build_floor(self.seed, index, self.modules) for index in range(len(_FLOORS))]
 
 
@@ -114,7 +113,6 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
 
 def _transformation(floor: int, number: int) -> str:
-    """Return the path of a scan's transformation."""
     folder = f"database/alignments/{_FLOORS[floor]}/transformations"
     return f"{folder}/{_BUILDING}_trans_{number:03d}.txt"
 

@@ -69,12 +69,10 @@ class FloorPlan:
         )
 
     def distance_to_path(self, x: float, y: float) -> float:
-        """Return the distance of (x, y) from the mapping rig's path."""
         return abs(_distance_inside(x, y, self.path))
 
     @property
     def path_length_m(self) -> float:
-        """Return the length of the rig's path."""
         return float(np.hypot(*(np.roll(self.path, -1, axis=0) - self.path).T).sum())
 
     def on_path(self, distance_m: ArrayLike) -> tuple[Floats, Floats]:
@@ -120,7 +118,6 @@ class MovingObject:
 
     @property
     def radius_m(self) -> float:
-        """Return the radius of its circle on the ground."""
         return 0.4 if self.kind == "person" else 2.2
 
 

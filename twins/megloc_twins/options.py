@@ -28,7 +28,6 @@ class TwinOptions(Options):
     supersampling: int = Field(default=2, ge=1, le=4, description="samples per pixel and axis")
 
     def world(self) -> SyntheticWorldOptions:
-        """Options of the rendered world."""
         names = SyntheticWorldOptions.model_fields.keys() & type(self).model_fields.keys()
         return SyntheticWorldOptions(**self.model_dump(include=names))
 

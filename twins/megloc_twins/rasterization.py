@@ -38,7 +38,6 @@ class SampleGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return the rows and columns of samples."""
         return self.camera.height * self.supersampling, self.camera.width * self.supersampling
 
     def rays(self) -> Float64:

@@ -196,7 +196,6 @@ class RenderedFrame:
 
 
 def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
-    """Return the texture atlas."""
     return build_atlas([recipe.paint() for recipe in recipes])
 
 

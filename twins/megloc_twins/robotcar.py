@@ -353,7 +353,6 @@ def _write_version_2(
 
 
 def _location(place: int) -> str:
-    """Format a location's number as in file names."""
     return f"{place + 1:03d}"
 
 

@@ -218,7 +218,6 @@ class Place:
 
     @property
     def name(self) -> str:
-        """Return the place's name in image paths and tables."""
         return f"place{self.index}"
 
     def cam_from_place(self, frame: Frame) -> RigidTransform:

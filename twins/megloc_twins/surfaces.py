@@ -59,7 +59,6 @@ class Surfaces:
         )
 
     def joined(self, other: Surfaces) -> Surfaces:
-        """Return these surfaces followed by the others."""
         names = (field.name for field in fields(self))
         return Surfaces(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
@@ -80,7 +79,6 @@ class SurfaceBuilder:
         uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
-        """Add a parallelogram; see :class:`Surfaces`."""
         self._rows.append((origin, edge_u, edge_v, texture, uv, glow))
 
     def add_box(
@@ -119,7 +117,6 @@ class SurfaceBuilder:
             self.add(corner, 2 * half_x * along, 2 * half_y * across, bottom, glow=glow)
 
     def build(self) -> Surfaces:
-        """Return all surfaces, in order."""
         count = len(self._rows)
         columns = list(zip(*self._rows, strict=True)) or [()] * 6
         origin, edge_u, edge_v = (settled(column).reshape(count, 3) for column in columns[:3])

@@ -109,7 +109,6 @@ class SyntheticWorld:
     queries: tuple[Frame, ...]  # sorted by name
 
     def frames(self) -> tuple[Frame, ...]:
-        """Return all images, the map's first."""
         return self.mapping + self.queries
 
 
@@ -198,7 +197,6 @@ def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
 
 
 def depth_name(image: str) -> str:
-    """Return the path of an image's depth map below ``records_data``."""
     return f"depth/{PurePosixPath(image).with_suffix('.depth')}"
 
 

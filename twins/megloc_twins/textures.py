@@ -109,7 +109,6 @@ def paint_ground(
 
 
 def _worn(rng: Generator, image: Rgb, strength: float, *, cell: float, octaves: int) -> Rgb:
-    """Add individual noise to the image."""
     noise = smooth_noise(rng, *image.shape[:2], cell=cell, octaves=octaves)
     return to_rgb(shade(image.astype(np.float32), 1 + strength * noise))
 
@@ -202,7 +201,6 @@ def paint_shutter(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_plain(rng: Generator, height: int, width: int) -> Rgb:
-    """Paint a plain surface, for ledges, pipes and reveals."""
     base = np.full(3, rng.uniform(80, 190), np.float32)
     base *= rng.uniform(0.92, 1.08, 3).astype(np.float32)
     field = 1 + 0.09 * smooth_noise(rng, height, width, cell=32, octaves=5)
