@@ -83,13 +83,8 @@ def to_rgb(image: Picture) -> Rgb:
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)
 
 
-def shade(image: Picture, factor: Field2D) -> Picture:
+def shade(image: Picture | Colour, factor: Field2D) -> Picture:
     return image * factor[..., None]
-
-
-def cv_colour(colour: Colour) -> tuple[float, float, float]:
-    """Convert a colour for OpenCV's drawing functions."""
-    return float(colour[0]), float(colour[1]), float(colour[2])
 
 
 def draw_glyphs(
@@ -113,7 +108,7 @@ def draw_glyphs(
             points = nodes[picks] * (0.55 * size, 0.5 * size) + (x, y)
             stroke = np.round(points * _FINE).astype(np.int32)
             closed = bool(rng.random() < 0.3)
-            cv2.polylines(image, [stroke], closed, cv_colour(colour), thickness, *_SMOOTH)
+            cv2.polylines(image, [stroke], closed, colour.tolist(), thickness, *_SMOOTH)
             x += 0.85 * size
 
 
@@ -123,7 +118,7 @@ def draw_shapes(rng: np.random.Generator, image: Rgb, count: int) -> None:
     extent = min(height, width)
     for _ in range(count):
         kind = int(rng.integers(0, 4))
-        colour = cv_colour(random_colour(rng, 10, 245))
+        colour = random_colour(rng, 10, 245).tolist()
         center = (int(rng.uniform(0, width) * _FINE), int(rng.uniform(0, height) * _FINE))
         radius = rng.uniform(0.06, 0.3) * extent
         if kind < 2:
