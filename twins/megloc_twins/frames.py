@@ -115,8 +115,8 @@ class Weather:
 
     elevation_deg: float | None  # of the sun above the horizon; None at night
     overcast: float = 0.0  # 0..1, attenuation of the sun by clouds
-    tint: Triple = (1.0, 1.0, 1.0)  # factor of the sun's light by day, of white balance at night
-    cast: Triple = (1.0, 1.0, 1.0)  # factor of the white balance by day
+    tint: Triple = (1.0, 1.0, 1.0)  # factor of the sun's light
+    cast: Triple = (1.0, 1.0, 1.0)  # factor of the white balance
     brightness: float = 1.0  # factor of the exposure
     blur_px: float | None = None  # blur by lens, drops and motion; None: as in the lighting
     noise: float = 1.0  # factor of the sensor noise's variance
@@ -143,15 +143,13 @@ def road_lighting(condition: str, rng: np.random.Generator, *, azimuth: float) -
     weather = WEATHERS[condition]
     if weather.elevation_deg is None:
         lighting = night_lighting(rng)
-        cast = weather.tint
     else:
         sun = azimuth, float(np.radians(weather.elevation_deg))
         lighting = day_lighting(rng, sun, overcast=weather.overcast)
         lighting = replace(lighting, sun=_product(lighting.sun, weather.tint))
-        cast = weather.cast
     return replace(
         lighting,
-        white_balance=_product(lighting.white_balance, cast),
+        white_balance=_product(lighting.white_balance, weather.cast),
         exposure=lighting.exposure * weather.brightness,
         blur_px=lighting.blur_px if weather.blur_px is None else weather.blur_px,
         shot_noise=lighting.shot_noise * weather.noise,

@@ -37,7 +37,6 @@ from megloc_twins.viewpoints import query_frames
 
 RIG_HEIGHT_M = 1.9
 _RIG_ID = "rig"
-_BONNET_SENSOR = "rig_front"
 # rig axes: x right, y down, z forward; metres
 SENSOR_FROM_RIG = {
     "rig_front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
@@ -92,7 +91,7 @@ def _mapping_frames(
                     lighting=day_lighting(rng, sun, overcast=0.15),
                     noise_seed=noise_seed(options.seed, image),
                     moving_objects=moving_objects,
-                    bonnet=sensor_id == _BONNET_SENSOR,
+                    bonnet=sensor_id == "rig_front",
                 )
             )
     return frames
@@ -112,9 +111,8 @@ class SyntheticWorld:
         return self.mapping + self.queries
 
 
-def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
+def build_world(options: SyntheticWorldOptions) -> SyntheticWorld:
     """Lay out the world and choose all frames, deterministically."""
-    options = options or SyntheticWorldOptions()
     places = tuple(build_place(options, index) for index in range(options.num_places))
     rig_from_world: dict[int, RigidTransform] = {}
     mapping: list[Frame] = []
