@@ -46,7 +46,7 @@ SMALL_WORLDS = {
             *("night_queries=1", "additional_night_queries=1", "width=320", "height=240"),
         ],
         "robotcar": [
-            *("num_locations=1", "stops_per_location=3", "moments_per_condition=2", "size_px=256"),
+            *("num_locations=1", "stops_per_location=3", "moments_per_condition=2", "size_px=256")
         ],
         "4seasons": [
             *("num_places=1", "map_keyframes=4", "winter_keyframes=1", "dusk_keyframes=1"),

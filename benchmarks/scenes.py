@@ -30,10 +30,7 @@ from megloc_kapture.evaluation.report.reports import PER_QUERY_CSV
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
 
-SEEDED = (
-    "global_features.options.seed",
-    "localization.pose.seed",
-)
+SEEDED = ("global_features.options.seed", "localization.pose.seed")
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 COLUMNS = ("scene", "seed", "query", "error_m", "error_deg")
 DRAWS = 10_000

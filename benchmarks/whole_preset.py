@@ -36,13 +36,7 @@ from pathlib import Path
 
 import pandas
 from whole_preset_artefacts import artefacts
-from whole_preset_scene import (
-    FREE_SCENE,
-    RANDOM_SCENE,
-    Scene,
-    write_displaced_truth,
-    write_scene,
-)
+from whole_preset_scene import FREE_SCENE, RANDOM_SCENE, Scene, write_displaced_truth, write_scene
 from whole_preset_weights import write_random_weights
 
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs

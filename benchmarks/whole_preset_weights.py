@@ -61,10 +61,7 @@ OFFICIAL = Sizes()
 
 
 def write_random_weights(
-    folder: Path,
-    seed: int = 0,
-    sizes: Sizes = OFFICIAL,
-    names: Collection[str] = (),
+    folder: Path, seed: int = 0, sizes: Sizes = OFFICIAL, names: Collection[str] = ()
 ) -> dict[str, Path]:
     """Write one file per network; return the paths by registry name.
 

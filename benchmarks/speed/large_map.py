@@ -23,15 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from street import (
-    CAMERA,
-    STEP_M,
-    Street,
-    in_view,
-    looking_left,
-    make_street,
-    nearest_images,
-)
+from street import CAMERA, STEP_M, Street, in_view, looking_left, make_street, nearest_images
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import (

@@ -48,10 +48,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import KaptureVectors, feature_folder
-from megloc_kapture.retrieval.search import (
-    FusedSearch,
-    FusionOptions,
-)
+from megloc_kapture.retrieval.search import FusedSearch, FusionOptions
 from megloc_kapture.values import Camera, RigidTransform
 
 TYPE = "generated"
@@ -73,12 +70,7 @@ def random_vectors(
 
 
 def generate(
-    folder: Path,
-    names: Sequence[str],
-    vectors: Iterable[Vectors],
-    dimension: int,
-    *,
-    tar: bool,
+    folder: Path, names: Sequence[str], vectors: Iterable[Vectors], dimension: int, *, tar: bool
 ) -> None:
     """Write a kapture folder with global features unless it exists."""
     if (folder / "complete").exists():

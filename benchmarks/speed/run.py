@@ -29,7 +29,6 @@ def main() -> None:
     parser.add_argument("--kloc-python", help="also run kapture-localization, with this Python")
     options, arguments = parser.parse_known_args()
     run("map_reading.py")
-    run("evaluation.py")
     run("localization.py")
     run("large_map.py")
     run("uncertainty.py")

@@ -1,27 +1,19 @@
 """Compare SuperPoint and SuperGlue with transformers' implementations on random weights.
 
     .venv/bin/python benchmarks/speed/superpoint_superglue.py
-    .venv/bin/python benchmarks/speed/superpoint_superglue.py --device cuda
 
-On a CPU: seconds of both, run alternately in one process, agreement of their results, and peak
-memory of a pair. On a GPU: agreement with the CPU in float32 and half precision, with weights that
-give peaked attention, and images and pairs per second. Random weights take as long as trained ones,
-except for a larger number of keypoint candidates.
+Both run alternately in one process, on the CPU, and their results are compared. Random weights take
+as long as trained ones, except for a larger number of keypoint candidates.
 """
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
-import resource
 import statistics
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,17 +21,11 @@ import torch
 from timing import table
 from torch.nn import functional
 
-from megloc_kapture.features.superpoint import (
-    SuperPoint,
-    SuperPointNet,
-    SuperPointOptions,
-    sample_descriptors,
-)
-from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
+from megloc_kapture.features.superpoint import SuperPointNet, sample_descriptors
 from megloc_kapture.nets.runtime import inference
 from megloc_kapture.nets.score_maps import pixel_scores, select_pixels, suppress_non_maxima
 from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, mutual_matches
-from megloc_kapture.values import Device, ImageFeatures
+from megloc_kapture.values import ImageFeatures
 
 WIDTH, HEIGHT = 1600, 1200
 THRESHOLD = 0.2
@@ -94,9 +80,9 @@ def superglue_weights() -> Weights:
     return weights
 
 
-def random_pair(num: int, seed: int = 0) -> tuple[ImageFeatures, ImageFeatures]:
+def random_pair(num: int) -> tuple[ImageFeatures, ImageFeatures]:
     """Return features of two images that share three quarters of their keypoints."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     xy = rng.uniform(0, [WIDTH, HEIGHT], (2, num, 2))
     descriptors = rng.standard_normal((2, num, 256))
     scores = rng.uniform(0.01, 0.9, (2, num))
@@ -281,100 +267,15 @@ def _jaccard(a: list[list[int]], b: list[list[int]]) -> float:
     return len(first & second) / max(len(first | second), 1)
 
 
-def peak_memory_mb(num: int, threads: int) -> tuple[float, float]:
-    """Return the memory of a separate process before matching a pair, and its peak."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_match_once, (num, threads))
-
-
-def _match_once(num: int, threads: int) -> tuple[float, float]:
-    torch.set_num_threads(threads)
-    with tempfile.TemporaryDirectory() as folder:
-        matcher = _plugins(Path(folder), "cpu", half=False)[1]
-        a, b = random_pair(num)
-        matcher.match(*random_pair(8))
-        before = _peak_mb()
-        matcher.match(a, b)
-        return before, _peak_mb()
-
-
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def _plugins(folder: Path, device: Device, *, half: bool) -> tuple[SuperPoint, SuperGlue]:
-    points, glue = folder / "superpoint_v1.pth", folder / "superglue_outdoor.pth"
-    if not points.exists():
-        torch.save(superpoint_weights(), points)
-        torch.save(superglue_weights(), glue)
-    return (
-        SuperPoint(SuperPointOptions(weights=str(points), device=device, half_precision=half)),
-        SuperGlue(SuperGlueOptions(weights=str(glue), device=device, half_precision=half)),
-    )
-
-
-def on_gpu(gpu: Device, num: int, repeat: int) -> None:
-    """Compare results and speed of the plugins on the GPU and the CPU."""
-    noise = (random_image()[0, 0].numpy() * 255).astype(np.uint8)
-    image = np.ascontiguousarray(np.repeat(noise[:, :, None], 3, axis=2))
-    a, b = random_pair(num)
-    others = [b, *(random_pair(num, seed)[1] for seed in range(1, 16))]
-    rows = [("", "images/s", "pairs/s", "keypoints", "matches", "scores differ by")]
-    with tempfile.TemporaryDirectory() as folder:
-        points, glue = _plugins(Path(folder), "cpu", half=False)
-        xy = points.extract(image).keypoints_px[:, :2].tolist()
-        matches, scores = glue.match(a, b)
-        confidence = dict(zip(map(tuple, matches.tolist()), scores.tolist(), strict=True))
-        kinds: tuple[tuple[str, Device, bool], ...] = (
-            ("CPU", "cpu", False),
-            ("GPU", gpu, False),
-            ("GPU, half precision", gpu, True),
-        )
-        for label, device, half in kinds:
-            points, glue = _plugins(Path(folder), device, half=half)
-            many = others if device == gpu else others[:1]
-            seconds = time_alternately(
-                {
-                    "image": partial(points.extract, image),
-                    "pairs": partial(glue.match_many, a, many),
-                },
-                repeat,
-            )
-            same_xy = _jaccard(points.extract(image).keypoints_px[:, :2].tolist(), xy)
-            gpu_matches, values = glue.match(a, b)
-            pairs = zip(map(tuple, gpu_matches.tolist()), values.tolist(), strict=True)
-            differ = [abs(value - confidence[key]) for key, value in pairs if key in confidence]
-            same = _jaccard(gpu_matches.tolist(), matches.tolist())
-            rows.append(
-                (
-                    label,
-                    f"{1 / seconds['image'].wall:.1f}",
-                    f"{len(many) / seconds['pairs'].wall:.1f}",
-                    f"{same_xy:.4f}",
-                    f"{same:.4f}",
-                    f"{max(differ):.0e}",
-                )
-            )
-    print(f"{WIDTH}x{HEIGHT}, {num} keypoints; keypoints and matches: Jaccard index to the CPU")
-    print(table(rows))
-    print(f"peak memory on the GPU {torch.cuda.max_memory_allocated(gpu) / 2**20:.0f} MB")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     parser.add_argument("--keypoints", type=int, default=1500)
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     os.environ["HF_HUB_OFFLINE"] = "1"
     torch.set_num_threads(options.threads)
-    if options.device != "cpu":
-        on_gpu(options.device, options.keypoints, options.repeat)
-        return
     load = os.getloadavg()[0]
-    # first, because a new process inherits the memory of this one
-    before, peak = peak_memory_mb(options.keypoints, options.threads)
     rows: list[tuple[str, ...]] = [
         ("seconds", "transformers", "ours", "ratio", "cpu", "ours", "ratio", "agreement")
     ]
@@ -382,7 +283,6 @@ def main() -> None:
     rows.append(superglue_row(options.keypoints, options.repeat))
     print(f"{WIDTH}x{HEIGHT}, {options.threads} threads, {options.repeat} repetitions")
     print(table(rows))
-    print(f"peak memory of a SuperGlue pair {peak:.0f} MB, {before:.0f} MB before the pair")
     print(f"load average {load:.1f} before, {os.getloadavg()[0]:.1f} after")
 
 

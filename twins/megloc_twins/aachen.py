@@ -6,7 +6,7 @@ converted to the published one when written.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.aachen.adapter import Layout
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
@@ -27,21 +26,16 @@ from megloc_twins.frames import (
     noise_seed,
     write_truth,
 )
-from megloc_twins.model_files import write_colmap_binary, write_nvm, write_query_list
 from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import (
-    ModelTwinOptions,
-    SyntheticDataset,
-    shuffled,
-    stream,
-    write_lines,
-)
+from megloc_twins.options import SyntheticDataset, TwinOptions, shuffled, stream, write_lines
 from megloc_twins.portable import settled_pose
 from megloc_twins.sparse_models import (
-    MapFrames,
+    Depths,
+    exact_tracks,
     nvm_model,
     render_map_and_queries,
-    write_sift_database,
+    write_colmap_model,
+    write_nvm,
 )
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import query_frames
@@ -64,21 +58,15 @@ _FILES = {  # image names, formatted with hour, minute, second and a running num
 _WRONG_IMAGE = 1228  # not used: db/1228.jpg has a wrong pose in the published model
 
 
-class AachenTwinOptions(ModelTwinOptions):
+class AachenTwinOptions(TwinOptions):
     """Contents of Aachen's twin; ``make eval`` uses the defaults."""
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
-    stations_per_place: int = Field(
-        default=8, ge=3, description="spots in each place where three photographs are taken"
-    )
-    sequence_images: int = Field(
-        default=5, ge=2, description="images of the sequence through each place"
-    )
+    stations_per_place: int = Field(default=8, ge=3, description="spots of three photographs each")
+    sequence_images: int = Field(default=5, ge=2, description="images of a place's sequence")
     day_queries: int = Field(default=24, ge=1, description="query images by day, all places")
     night_queries: int = Field(default=16, ge=1, description="query images at night, all places")
-    additional_night_queries: int = Field(
-        default=8, ge=1, description="query images at night that v1.0 does not have"
-    )
+    additional_night_queries: int = Field(default=8, ge=1, description="that v1.0 lacks")
     width: int = Field(default=640, ge=64, description="image width in px; a portrait's height")
     height: int = Field(default=480, ge=48, description="image height in px")
 
@@ -86,16 +74,15 @@ class AachenTwinOptions(ModelTwinOptions):
 class AachenTwin(SyntheticDataset[AachenTwinOptions]):
     """Aachen Day-Night v1.1 in its published layout, which includes v1.0, with true poses.
 
-    ``images_upright/``, ``3D-models/`` (v1.0's NVM, its list and ``database_intrinsics.txt``;
+    ``images_upright/``, ``3D-models/`` (v1.0's NVM and ``database_intrinsics.txt``;
     ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
     of the original: numbers of database images are unordered, the NVM has another order, feature
     numbers in the NVM have gaps, v1.1's night list replaces v1.0's, lists lack the last line break,
-    and some images below ``query/`` are in no list. With ``model_features`` also ``aachen.db``, the
-    features of v1.0's model; v1.1's features are not published.
+    and some images below ``query/`` are in no list.
     """
 
     Options = AachenTwinOptions
-    version = 2
+    version = 3
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         root, options = Path(root), self.options
@@ -104,12 +91,9 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
         mapping = in_frame(frames.mapping(), OFFICIAL_FROM_WORLD)
         database = mapping[: len(frames.database)]
         others, images = [*frames.queries(), *frames.unlisted], root / "images_upright"
-        drawn = render_map_and_queries(options, frames.mapping(), others, images, work)
-        _write_nvm_model(models, options, database, drawn)
-        if options.model_features:
-            by_name = {frame.name: frame for frame in database}
-            write_sift_database(Layout(root).feature_database, by_name, drawn.features)
-        _write_colmap_model(models / "aachen_v_1_1", options, mapping, drawn)
+        depths_m = render_map_and_queries(options, frames.mapping(), others, images, work)
+        _write_nvm_model(models, options, database, depths_m)
+        _write_colmap_model(models / "aachen_v_1_1", options, mapping, depths_m)
         _write_lists(root / "queries", frames)
         queries = in_frame(frames.queries(), OFFICIAL_FROM_WORLD)
         # nothing was taken at the same time
@@ -117,7 +101,7 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
             [replace(frame, timestamp=time) for time, frame in enumerate(some)]
             for some in (mapping, queries)
         )
-        write_truth(root, *timed, named=False)
+        write_truth(root, *timed)
         return {
             "places": options.num_places,
             "mapping images": len(mapping),
@@ -136,11 +120,9 @@ class AachenFrames:
     unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
 
     def mapping(self) -> tuple[Frame, ...]:
-        """Return all map images."""
         return self.database + self.sequences
 
     def queries(self) -> tuple[Frame, ...]:
-        """Return all listed queries."""
         return self.day + self.night
 
 
@@ -236,8 +218,7 @@ def _map_frame(
     sun: tuple[float, float],
     rng: np.random.Generator,
 ) -> Frame:
-    """Return a hand-held image at a position (place's frame, metres); ``names`` are those of the
-    image and of its sensor."""
+    """Return a hand-held image at a position; ``names`` are those of image and sensor."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
     return Frame(
         name=names[0],
@@ -292,22 +273,21 @@ def _as_telephones(
 
 
 def _write_nvm_model(
-    folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
+    folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], depths_m: Depths
 ) -> None:
     """Write v1.0's NVM, which has only focal lengths, and the list of complete cameras."""
     rng = stream(options.seed, "aachen", "points", "1.0")
-    points = drawn.points(frames, rng)
-    if not drawn.features:
-        # as if some features observed no point
-        points = replace(points, feature_ids=3 * points.feature_ids + 1)
+    points = exact_tracks(frames, depths_m, rng)
+    # as if some features observed no point
+    points = replace(points, feature_ids=3 * points.feature_ids + 1)
     cameras = {frame.name: frame.camera for frame in frames}
     write_nvm(folder / "aachen_cvpr2018_db.nvm", nvm_model(list(cameras), frames, points))
-    write_lines(folder / "aachen_cvpr2018_db.list.txt", list(cameras))
-    write_query_list(folder / "database_intrinsics.txt", dict(sorted(cameras.items())))
+    path = folder / "database_intrinsics.txt"
+    _write_cameras(path, dict(sorted(cameras.items())), last_line_ends=True)
 
 
 def _write_colmap_model(
-    folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
+    folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], depths_m: Depths
 ) -> None:
     """Write v1.1's model: image and camera ids are unordered, and a sequence shares a camera."""
     rng = stream(options.seed, "aachen", "points", "1.1")
@@ -321,15 +301,22 @@ def _write_colmap_model(
             ColmapImage(image_id, frame.name, camera_ids[frame.sensor_id], frame.cam_from_world)
             for image_id, frame in zip(image_ids, frames, strict=False)
         ),
-        points=drawn.points(frames, rng),
+        points=exact_tracks(frames, depths_m, rng),
     )
-    write_colmap_binary(folder, model)
+    write_colmap_model(folder, model, text=False)
 
 
 def _write_lists(folder: Path, frames: AachenFrames) -> None:
     for when, some in (("day", frames.day), ("night", frames.night)):
         cameras = {frame.name: frame.camera for frame in some}
         path = folder / f"{when}_time_queries_with_intrinsics.txt"
-        write_query_list(path, cameras, last_line_ends=False)
-    names = [frame.name for frame in frames.day]
-    write_lines(folder / "day_time_queries_without_intrinsics.txt", names)
+        _write_cameras(path, cameras, last_line_ends=False)
+
+
+def _write_cameras(path: Path, cameras: Mapping[str, Camera], *, last_line_ends: bool) -> None:
+    """Write a camera list; numbers have the fewest digits that preserve their value."""
+    lines = []
+    for name, camera in cameras.items():
+        numbers = [str(int(v)) if v.is_integer() else repr(v) for v in camera.params]
+        lines.append(" ".join((name, camera.model, f"{camera.width} {camera.height}", *numbers)))
+    write_lines(path, lines, last_line_ends=last_line_ends)

@@ -40,8 +40,7 @@ _MASONRY: dict[str, tuple[int, int, float, float, float]] = {
 def smooth_noise(
     rng: np.random.Generator, height: int, width: int, *, cell: float, octaves: int = 4
 ) -> Field2D:
-    """Return multi-octave noise of zero mean and unit standard deviation; ``cell`` is the cell size
-    of the coarsest octave, texels."""
+    """Return normalised noise; ``cell`` is the cell size of the coarsest octave, texels."""
     total = np.zeros((height, width), np.float32)
     amplitude = 1.0
     for _ in range(octaves):
@@ -84,14 +83,8 @@ def to_rgb(image: Picture) -> Rgb:
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)
 
 
-def shade(image: Picture, factor: Field2D) -> Picture:
-    """Multiply a picture by a field (H, W)."""
+def shade(image: Picture | Colour, factor: Field2D) -> Picture:
     return image * factor[..., None]
-
-
-def cv_colour(colour: Colour) -> tuple[float, float, float]:
-    """Convert a colour for OpenCV's drawing functions."""
-    return float(colour[0]), float(colour[1]), float(colour[2])
 
 
 def draw_glyphs(
@@ -115,7 +108,7 @@ def draw_glyphs(
             points = nodes[picks] * (0.55 * size, 0.5 * size) + (x, y)
             stroke = np.round(points * _FINE).astype(np.int32)
             closed = bool(rng.random() < 0.3)
-            cv2.polylines(image, [stroke], closed, cv_colour(colour), thickness, *_SMOOTH)
+            cv2.polylines(image, [stroke], closed, colour.tolist(), thickness, *_SMOOTH)
             x += 0.85 * size
 
 
@@ -125,7 +118,7 @@ def draw_shapes(rng: np.random.Generator, image: Rgb, count: int) -> None:
     extent = min(height, width)
     for _ in range(count):
         kind = int(rng.integers(0, 4))
-        colour = cv_colour(random_colour(rng, 10, 245))
+        colour = random_colour(rng, 10, 245).tolist()
         center = (int(rng.uniform(0, width) * _FINE), int(rng.uniform(0, height) * _FINE))
         radius = rng.uniform(0.06, 0.3) * extent
         if kind < 2:
@@ -155,7 +148,6 @@ def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
 
 
 def _blocks(rng: np.random.Generator, base: Colour, kind: str) -> Picture:
-    """Draw a tile of masonry blocks."""
     rows, cols, spread, joint, joint_grey = _MASONRY[kind]
     y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
     v = (y + 0.5) / TILE * rows
@@ -193,8 +185,7 @@ def material_tile(kind: str, seed: int) -> Picture:
 
 
 def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> Picture:
-    """Return a surface (height, width, 3) of the material; ``shift`` moves the tile by rows and
-    columns."""
+    """Return a surface (height, width, 3) of the material, moved by ``shift`` (rows, columns)."""
     tile = np.roll(material_tile(kind, seed), shift, axis=(0, 1))
     repeats = (-(-height // TILE), -(-width // TILE), 1)
     return np.tile(tile, repeats)[:height, :width]

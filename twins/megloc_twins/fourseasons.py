@@ -6,42 +6,69 @@ dusk, with poses that are withheld as in a challenge. Relocalization files list 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial, reduce
-from operator import xor
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.fourseasons_drive import (
-    CAM1_FROM_CAM0,
-    Drive,
-    Moment,
-    drive_moments,
-    stereo_camera,
-    winter_place,
+from megloc_twins.frames import (
+    Frame,
+    Lighting,
+    Role,
+    day_lighting,
+    in_frame,
+    looking_at,
+    night_lighting,
+    noise_seed,
+    write_truth,
 )
-from megloc_twins.frames import Frame, write_truth
-from megloc_twins.options import SyntheticDataset, TwinOptions, stream, write_lines
+from megloc_twins.moving_objects import FloorPlan, place_moving_objects
+from megloc_twins.options import (
+    SyntheticDataset,
+    SyntheticWorldOptions,
+    TwinOptions,
+    seed_of,
+    stream,
+    write_lines,
+)
 from megloc_twins.portable import settled, settled_pose
 from megloc_twins.render import RenderedFrame, render_frames
-from megloc_twins.squares import build_place
+from megloc_twins.squares import Place, build_place
 
 REFERENCE = "recording_2020-06-18_10-12-33"
 WINTER = "recording_2021-01-15_13-04-17"
 DUSK = "recording_2021-03-22_18-41-05"
 
+# calibration of the published recordings: pixels for images of 800x400, and metres
+_FOCAL_PX, _CENTRE_PX = 501.4757919305817, (421.7953735163109, 167.65799492501083)
+_PUBLISHED_SIZE = (800, 400)
+CAM1_FROM_CAM0 = RigidTransform((1.0, 0.0, 0.0, 0.0), (-0.3004961618953472, 0.0, 0.0))
+
+_CAMERA_HEIGHT_M = 1.6
+_LOOK_AHEAD_M = 2.0  # the car begins to turn before a corner
+_STEP_M = 0.17  # between consecutive frames
+_FRAME_NS = 33_333_337
+_FRAMES_PER_KEYFRAME = 3  # the keyframe and the frames after it
+_EXTRA_EVERY = 8  # after every 8th keyframe, the next frame also has images
+_MARGIN_M = 0.35
+
+Season = Literal["summer", "winter", "dusk"]
+_SUN = {"summer": (45.0, 60.0), "winter": (20.0, 30.0), "dusk": (0.0, 5.0)}  # elevation, degrees
+_DUSK_SKY = (0.014, 0.03)
+_DUSK_EXPOSURE = 0.65
+
 _EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
 _GREY = np.array([299, 587, 114])  # weights of R, G and B, thousandths
-
-_TAGS = "translation vector, rotation quaternion"
 
 
 def _settled_earth_from_enu(
@@ -56,24 +83,49 @@ def _settled_earth_from_enu(
 EARTH_FROM_WORLD = _settled_earth_from_enu(48.1861, 11.6197, 540.0)
 
 
+@dataclass(frozen=True)
+class Moment:
+    """The car at a ``timestamp`` in nanoseconds, which may be a keyframe of the odometry.
+
+    ``frames`` are the images of both cameras; empty if the recording has none of this moment.
+    """
+
+    timestamp: int
+    cam0_from_world: RigidTransform
+    keyframe: bool
+    frames: tuple[Frame, ...]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A recording: route, time and appearance."""
+
+    name: str  # contains the time
+    season: Season  # determines light and ground
+    keyframes_per_place: int  # at equal distances along a place's path
+    role: Role  # of its images
+    lateral_m: float  # largest lateral deviation from the path
+    turn_deg: float  # largest deviation from the path's direction
+
+
+def stereo_camera(width: int, height: int) -> Camera:
+    """Return the intrinsics of either camera, PINHOLE."""
+    sx, sy = width / _PUBLISHED_SIZE[0], height / _PUBLISHED_SIZE[1]
+    params = (_FOCAL_PX * sx, _FOCAL_PX * sx, _CENTRE_PX[0] * sx, _CENTRE_PX[1] * sy)
+    return Camera("PINHOLE", width, height, params)
+
+
 class FourSeasonsTwinOptions(TwinOptions):
     """Contents of 4Seasons' twin."""
 
     num_places: int = Field(default=4, ge=1, description="places on the route")
-    map_keyframes: int = Field(
-        default=12, ge=3, description="keyframes of the map recording in each place"
-    )
-    winter_keyframes: int = Field(
-        default=6, ge=1, description="keyframes of the winter recording in each place"
-    )
-    dusk_keyframes: int = Field(
-        default=4, ge=1, description="keyframes of the dusk recording in each place"
-    )
+    map_keyframes: int = Field(default=12, ge=3, description="map keyframes per place")
+    winter_keyframes: int = Field(default=6, ge=1, description="winter keyframes per place")
+    dusk_keyframes: int = Field(default=4, ge=1, description="dusk keyframes per place")
     width: int = Field(default=800, ge=64, description="image width in px")
     height: int = Field(default=400, ge=48, description="image height in px")
 
     def drives(self) -> tuple[Drive, Drive, Drive]:
-        """Return the recordings, the map's first."""
         return (
             Drive(REFERENCE, "summer", self.map_keyframes, "mapping", 0.1, 2),
             Drive(WINTER, "winter", self.winter_keyframes, "query", 0.6, 8),
@@ -89,7 +141,7 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
     """
 
     Options = FourSeasonsTwinOptions
-    version = 3
+    version = 4
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         options, drives = self.options, self.options.drives()
@@ -104,7 +156,11 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
                     _relocalization_lines(keyframes[REFERENCE], keyframes[drive.name]),
                 )
         asked = [*keyframes[WINTER], *keyframes[DUSK]]
-        write_truth(root, _on_earth(keyframes[REFERENCE]), _on_earth(asked))
+        truth = (
+            in_frame([frame for moment in moments for frame in moment.frames], EARTH_FROM_WORLD)
+            for moments in (keyframes[REFERENCE], asked)
+        )
+        write_truth(root, *truth)
         return {
             "places": options.num_places,
             "mapping images": 2 * len(keyframes[REFERENCE]),
@@ -112,30 +168,137 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
         }
 
 
+def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
+    """Return the moments of a drive through all places, in order of time."""
+    rng = stream(options.seed, "drive", drive.name)
+    moments = []
+    start = datetime.strptime(drive.name, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
+    clock = int(start.timestamp()) * 10**9
+    for index in range(options.num_places):
+        place = build_place(options, index)
+        sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[drive.season])))
+        phase = rng.uniform(0.25, 0.75) if drive.role == "query" else 0.5
+        for stop in range(drive.keyframes_per_place):
+            along = (stop + phase) / drive.keyframes_per_place * place.plan.path_length_m
+            lateral = _free_offset(place.plan, along, drive.lateral_m, rng)
+            turn = float(np.radians(rng.uniform(-drive.turn_deg, drive.turn_deg)))
+            pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
+            for step in range(_FRAMES_PER_KEYFRAME):
+                clock += _FRAME_NS + int(rng.integers(-40_000, 40_000))
+                # published timestamps were rounded by a conversion to float seconds
+                timestamp = int(clock / 1e9 * 1e9)
+                spot, heading = _beside(place.plan, along + step * _STEP_M, lateral)
+                position = np.array([*spot, _CAMERA_HEIGHT_M])
+                cam_from_place = looking_at(position, heading + turn, pitch, roll)
+                pose = cam_from_place @ place.place_from_world
+                frames: tuple[Frame, ...] = ()
+                if step == 0 or (step == 1 and stop % _EXTRA_EVERY == 1):
+                    frames = _frames(options, drive, place, timestamp, pose, position, sun, rng)
+                moments.append(Moment(timestamp, pose, step == 0, frames))
+        clock += 20_000_000_000  # the drive to the next place is not recorded
+    return moments
+
+
+def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
+    """Return a place in winter: other leaves, patches and markings, on wet asphalt."""
+    place = build_place(options, index)
+    seed = seed_of(options.seed, "winter", index)
+    recipes = []
+    for recipe in place.recipes:
+        if recipe.painter == "ground":
+            params = dict(recipe.params) | {"material": "asphalt"}
+            recipe = replace(recipe, seed=seed, params=tuple(params.items()))
+        recipes.append(recipe)
+    return replace(place, recipes=tuple(recipes))
+
+
+def _lighting(season: Season, rng: np.random.Generator, sun: tuple[float, float]) -> Lighting:
+    if season == "dusk":
+        night = night_lighting(rng, exposure=_DUSK_EXPOSURE)
+        # the lamps are on, and the sky is still slightly bright
+        light = float(rng.uniform(*_DUSK_SKY))
+        sky = (0.85 * light, 0.95 * light, 1.25 * light)
+        return replace(night, sky=sky, sky_colour=sky)
+    overcast = 0.15 if season == "summer" else float(rng.choice([0.3, 0.7, 1.0]))
+    return day_lighting(rng, sun, overcast=overcast)
+
+
+def _frames(
+    options: SyntheticWorldOptions,
+    drive: Drive,
+    place: Place,
+    timestamp: int,
+    cam0_from_world: RigidTransform,
+    position: NDArray[np.float64],
+    sun: tuple[float, float],
+    rng: np.random.Generator,
+) -> tuple[Frame, ...]:
+    moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
+    lighting = _lighting(drive.season, rng, sun)
+    poses = {"cam0": cam0_from_world, "cam1": CAM1_FROM_CAM0 @ cam0_from_world}
+    frames = []
+    for sensor_id, pose in poses.items():
+        name = f"{drive.name}/undistorted_images/{sensor_id}/{timestamp}.png"
+        frames.append(
+            Frame(
+                name=name,
+                role=drive.role,
+                condition=drive.name,
+                place=place.index,
+                timestamp=timestamp,
+                sensor_id=sensor_id,
+                camera=stereo_camera(options.width, options.height),
+                cam_from_world=pose,
+                lighting=lighting,
+                noise_seed=noise_seed(options.seed, name),
+                moving_objects=moving_objects,
+                bonnet=True,
+            )
+        )
+    return tuple(frames)
+
+
+def _free_offset(plan: FloorPlan, along: float, most: float, rng: np.random.Generator) -> float:
+    """Draw a deviation to the left of the path, metres, that avoids all obstacles."""
+    for _ in range(50):
+        offset = float(rng.uniform(-most, most))
+        steps = range(_FRAMES_PER_KEYFRAME)
+        track = [_beside(plan, along + step * _STEP_M, offset)[0].tolist() for step in steps]
+        if all(plan.is_free(x, y, _MARGIN_M) for x, y in track):
+            return offset
+    return 0.0
+
+
+def _beside(plan: FloorPlan, along: float, offset: float) -> tuple[NDArray[np.float64], float]:
+    """Return position (2,) and direction (radians) of a car ``offset`` metres left of the path."""
+    (ahead, behind, spot), _ = plan.on_path([along + _LOOK_AHEAD_M, along - 0.5, along])
+    heading = float(np.arctan2(*(ahead - behind)[::-1]))
+    return spot + offset * np.array([-np.sin(heading), np.cos(heading)]), heading
+
+
 def _write_recording(
     root: Path, options: FourSeasonsTwinOptions, drive: Drive, moments: list[Moment], work: Work
 ) -> None:
     folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
-    published = drive.name != DUSK  # poses of test recordings are withheld
     keyframes = [moment for moment in moments if moment.keyframe]
     render_frames(
         options.world(),
         [frame for moment in moments for frame in moment.frames],
         partial(_write_grey, root),
         build=winter_place if drive.season == "winter" else build_place,
-        sky_seed=drive.sky_seed(options.seed),
+        # with the same dirt as in the map, the bonnet would yield the best matches of queries
+        sky_seed=options.seed + (list(_SUN).index(drive.season) << 32),
         work=work,
     )
     times = (moment.timestamp for moment in moments)  # most have no images
     rows = [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
     write_lines(folder / "times.txt", rows)
-    if not published:
+    if drive.name == DUSK:  # poses of test recordings are withheld
         return
     slam = SlamFrames.drawn(options.seed, drive.name)
     write_lines(folder / "GNSSPoses.txt", _gnss_lines(slam, keyframes))
     blank_lines = drive.name == REFERENCE
     write_lines(folder / "Transformations.txt", _transformation_lines(slam, blank_lines))
-    write_lines(folder / "septentrio.nmea", _nmea_lines(keyframes))
 
 
 def _write_grey(root: Path, frame: Frame, view: RenderedFrame) -> None:
@@ -143,34 +306,17 @@ def _write_grey(root: Path, frame: Frame, view: RenderedFrame) -> None:
     write_image(root / frame.name, grey)
 
 
-def _on_earth(moments: Iterable[Moment]) -> Iterator[Frame]:
-    """Yield the moments' frames with each camera's pose in ECEF."""
-    world_from_earth = EARTH_FROM_WORLD.inverse()
-    cams_from_cam0 = (RigidTransform.identity(), CAM1_FROM_CAM0)
-    for moment in moments:
-        for frame, cam_from_cam0 in zip(moment.frames, cams_from_cam0, strict=True):
-            pose = cam_from_cam0 @ moment.cam0_from_world @ world_from_earth
-            yield replace(frame, cam_from_world=pose)
-
-
 @dataclass(frozen=True)
 class SlamFrames:
-    """Transforms between a recording's coordinate frames, as in its files.
-
-    Parameters
-    ----------
-    s_from_as, w_from_gpsw, e_from_gpsw : named as in ``Transformations.txt``.
-    scale : metres per unit of the SLAM world.
-    """
+    """Transforms between a recording's coordinate frames, named as in ``Transformations.txt``."""
 
     s_from_as: RigidTransform
     w_from_gpsw: RigidTransform
     e_from_gpsw: RigidTransform
-    scale: float
+    scale: float  # metres per unit of the SLAM world
 
     @classmethod
     def drawn(cls, seed: int, recording: str) -> SlamFrames:
-        """Draw the coordinate frames of a recording."""
         rng = stream(seed, "frames", recording)
         # the scenes of different recordings have origins some hundred metres apart
         east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
@@ -184,8 +330,7 @@ class SlamFrames:
         )
 
     def slam_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
-        """Return a pose in the convention of ``GNSSPoses.txt``, translation in units of the SLAM
-        world."""
+        """Return a pose as in ``GNSSPoses.txt``, translation in units of the SLAM world."""
         s_from_world = self.w_from_gpsw @ self.e_from_gpsw.inverse() @ EARTH_FROM_WORLD
         metric = self.s_from_as.inverse() @ s_from_world @ cam_from_world.inverse()
         x, y, z = (value / self.scale for value in metric.translation)
@@ -204,7 +349,8 @@ def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
         ("transform_gps_imu", RigidTransform.identity()),
         ("transform_e_gpsw", slam.e_from_gpsw),
     ):
-        lines += [f"# {name}: {_TAGS}", _pose_fields(transform, ",", 6), *[""] * blank_lines]
+        heading = f"# {name}: translation vector, rotation quaternion"
+        lines += [heading, _pose_fields(transform, 6), *[""] * blank_lines]
     return [*lines, "# GNSS scale", f"{slam.scale:.6f}"]
 
 
@@ -215,32 +361,12 @@ def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
         "fusion_quality, v3"
     ]
     for moment in keyframes:
-        pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), ",", 12)
+        pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), 12)
         lines.append(f"{moment.timestamp},{pose},{slam.scale:.6f},2")
     return lines
 
 
-def _nmea_lines(keyframes: Sequence[Moment]) -> list[str]:
-    """Format a GNSS fix per keyframe, after a truncated line."""
-    lines = [",D*1C"]
-    for moment in keyframes:
-        clock = datetime.fromtimestamp(moment.timestamp // 10**9, UTC)
-        hundredths = moment.timestamp // 10**7 % 100
-        position = (EARTH_FROM_WORLD @ moment.cam0_from_world.inverse()).translation
-        latitude, longitude, height = geodetic(np.array(position))
-        time = f"{clock:%H%M%S}.{hundredths:02d}"
-        place = f"{_degrees_minutes(latitude, 2)},N,{_degrees_minutes(longitude, 3)},E"
-        for content in (
-            f"GPRMC,{time},A,{place},7.0,251.7,{clock:%d%m%y},3.5,W,D",
-            f"GPGGA,{time},{place},4,09,1.1,{height:.4f},M,0.0000,M,0.6,3119",
-        ):
-            checksum = reduce(xor, content.encode())
-            lines.append(f"${content}*{checksum:02X}")
-    return lines
-
-
 def _write_calibration(folder: Path, camera: Camera) -> None:
-    """Write the calibration files of undistorted images."""
     params = " ".join(map(repr, camera.params))
     size = f"{camera.width} {camera.height}"
     for number in (0, 1):
@@ -263,8 +389,7 @@ def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]
 def _random_transform(
     rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
 ) -> RigidTransform:
-    """Draw a translation, and a rotation by up to ``yaw`` about z and ``tilt`` about x and y,
-    radians."""
+    """Draw a translation, and a rotation by ``yaw`` about z and ``tilt`` about x and y at most."""
     ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
     cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
     sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()
@@ -278,19 +403,13 @@ def _random_transform(
 
 
 def _as_written(transform: RigidTransform) -> RigidTransform:
-    """Round a transform to six decimals."""
     quat = np.round(transform.quat_wxyz, 6)
     w, x, y, z = (quat / np.sqrt((quat * quat).sum())).tolist()
     tx, ty, tz = np.round(transform.translation, 6).tolist()
     return RigidTransform((w, x, y, z), (tx, ty, tz))
 
 
-def _pose_fields(pose: RigidTransform, separator: str, decimals: int) -> str:
+def _pose_fields(pose: RigidTransform, decimals: int) -> str:
     """Format translation, then rotation x y z w."""
     w, x, y, z = pose.quat_wxyz
-    return separator.join(f"{value:.{decimals}f}" for value in (*pose.translation, x, y, z, w))
-
-
-def _degrees_minutes(angle_deg: float, digits: int) -> str:
-    degrees = int(angle_deg)
-    return f"{degrees:0{digits}d}{(angle_deg - degrees) * 60:010.7f}"
+    return ",".join(f"{value:.{decimals}f}" for value in (*pose.translation, x, y, z, w))

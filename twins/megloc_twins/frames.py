@@ -75,7 +75,7 @@ def day_lighting(
     )
 
 
-def night_lighting(rng: np.random.Generator, *, exposure: float) -> Lighting:
+def night_lighting(rng: np.random.Generator, *, exposure: float = 1.0) -> Lighting:
     """Return night light: warm lamps, a faint blue sky, a noisy sensor and more blur."""
     return Lighting(
         condition="night",
@@ -115,8 +115,8 @@ class Weather:
 
     elevation_deg: float | None  # of the sun above the horizon; None at night
     overcast: float = 0.0  # 0..1, attenuation of the sun by clouds
-    tint: Triple = (1.0, 1.0, 1.0)  # factor of the sun's light by day, of white balance at night
-    cast: Triple = (1.0, 1.0, 1.0)  # factor of the white balance by day
+    tint: Triple = (1.0, 1.0, 1.0)  # factor of the sun's light
+    cast: Triple = (1.0, 1.0, 1.0)  # factor of the white balance
     brightness: float = 1.0  # factor of the exposure
     blur_px: float | None = None  # blur by lens, drops and motion; None: as in the lighting
     noise: float = 1.0  # factor of the sensor noise's variance
@@ -135,30 +135,21 @@ WEATHERS: dict[str, Weather] = {
 }
 
 
-def road_lighting(
-    condition: str, rng: np.random.Generator, *, azimuth: float, night_exposure: float = 1.0
-) -> Lighting:
-    """Return the lighting of an image of a traversal.
+def road_lighting(condition: str, rng: np.random.Generator, *, azimuth: float) -> Lighting:
+    """Return the lighting of an image of a traversal in one of the WEATHERS.
 
-    Parameters
-    ----------
-    condition : a name in :data:`WEATHERS`, else KeyError.
-    rng : exposure and white balance vary a little from image to image.
-    azimuth : of the sun, radians, in the place's frame.
-    night_exposure : light that reaches the sensor at night, relative.
+    ``azimuth`` is that of the sun, radians, in the place's frame.
     """
     weather = WEATHERS[condition]
     if weather.elevation_deg is None:
-        lighting = night_lighting(rng, exposure=night_exposure)
-        cast = weather.tint
+        lighting = night_lighting(rng)
     else:
         sun = azimuth, float(np.radians(weather.elevation_deg))
         lighting = day_lighting(rng, sun, overcast=weather.overcast)
         lighting = replace(lighting, sun=_product(lighting.sun, weather.tint))
-        cast = weather.cast
     return replace(
         lighting,
-        white_balance=_product(lighting.white_balance, cast),
+        white_balance=_product(lighting.white_balance, weather.cast),
         exposure=lighting.exposure * weather.brightness,
         blur_px=lighting.blur_px if weather.blur_px is None else weather.blur_px,
         shot_noise=lighting.shot_noise * weather.noise,
@@ -240,15 +231,12 @@ def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> li
     ]
 
 
-def kapture_records(
-    frames: Iterable[Frame], *, poses: bool = True, named: bool = True
-) -> KaptureData:
-    """Return sensors, records and poses of the frames; ``named`` gives sensors their id as name."""
+def kapture_records(frames: Iterable[Frame], *, poses: bool = True) -> KaptureData:
+    """Return sensors, records and, on request, poses of the frames."""
     data = KaptureData()
     for frame in frames:
         record = frame.timestamp, frame.sensor_id
-        name = frame.sensor_id if named else ""
-        data.sensors[frame.sensor_id] = Sensor.from_camera(frame.camera, name=name)
+        data.sensors[frame.sensor_id] = Sensor.from_camera(frame.camera, name=frame.sensor_id)
         data.records_camera[record] = frame.name
         if poses:
             data.trajectories[record] = frame.cam_from_world
@@ -260,11 +248,10 @@ def write_truth(
     mapping: Iterable[Frame],
     queries: Iterable[Frame],
     *,
-    named: bool = True,
     rigs: Mapping[str, dict[str, RigidTransform]] | None = None,
 ) -> None:
-    """Write the true poses of all images as kapture below ``root``; raises OutputError."""
+    """Write the true poses of all images as kapture below ``root``."""
     for role, frames in (("mapping", mapping), ("query", queries)):
-        data = kapture_records(frames, named=named)
+        data = kapture_records(frames)
         data.rigs.update(rigs or {})
         write_sensors(root / GROUND_TRUTH / role, data)

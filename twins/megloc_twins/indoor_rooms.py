@@ -7,7 +7,7 @@ floor has a separate coordinate frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -65,8 +65,7 @@ class Recipes:
         return index_of(TextureRecipe(painter, *_SIZES[painter], number), self.items)
 
     def material(self, kind: str, size_m: tuple[float, float], *label: str | int) -> int:
-        """Return a texture of a wall, floor or ceiling; equal labels and sizes give equal
-        textures."""
+        """Return a texture of a wall, floor or ceiling, equal for equal labels and sizes."""
         number = seed_of(self.seed, "indoor", kind, *label)
         material_seed = seed_of(self.seed, "indoor", label[0])
         params = (("material", kind), ("material_seed", material_seed), ("dirt", _DIRT))
@@ -91,8 +90,12 @@ class Parts:
         shared, own = self.shared.build(), self.own.build()
         return shared.joined(own), np.arange(len(shared) + len(own)) >= len(shared)
 
+    def wall(self, start: Point, end: Point, texture: int, trim: int) -> Wall:
+        """Return the wall from ``start`` (left, seen from the front) to ``end``."""
+        ends = np.array(start), np.array(end)
+        return Wall.between(self.shared, ends, texture, trim, _HEIGHT_M)
+
     def lamp(self, x: float, y: float) -> None:
-        """Add a lamp under the ceiling."""
         glow, plain = self.recipes.thing("glow", "lamp"), self.recipes.thing("plain", "lamp")
         low = _HEIGHT_M - 0.08
         self.shared.add_box(
@@ -101,7 +104,6 @@ class Parts:
         self.lamps.append(np.array([x, y, low - 0.1]))
 
     def floor_and_ceiling(self, kind: str) -> None:
-        """Add floor and ceiling."""
         low, high = self.low, self.high
         size_m = high[0] - low[0], high[1] - low[1]
         along, across = np.array([size_m[0], 0.0, 0.0]), np.array([0.0, size_m[1], 0.0])
@@ -119,12 +121,11 @@ class Parts:
         size: tuple[float, float] = _POSTER_M,
         painter: str = "poster",
     ) -> None:
-        """Add a flat object to a wall; ``at`` is its lower left corner, along the wall and above
-        the floor."""
+        """Add a flat object to a wall; ``at`` is its lower left corner."""
         span, height = (at[0], at[0] + size[0]), (at[1], at[1] + size[1])
         texture = self.recipes.thing(painter, *label)
-        builder = self.own if own else self.shared
-        on.block(builder, span, height, 0.03, front=texture, other=on.trim)
+        on = replace(on, builder=self.own if own else self.shared)
+        on.block(span, height, 0.03, texture, on.trim)
 
     def rug(self, at: Point, size: tuple[float, float], *label: str | int) -> None:
         """Add an individual rug on the floor; ``at`` is its centre."""
@@ -151,11 +152,6 @@ class Parts:
         self.shared.add_box((x, y), (0.45, 0.45, 0.45), 0.0, cloth, cloth)
         self.shared.add_box((x, y - 0.2), (0.45, 0.06, 0.45), 0.0, cloth, cloth, base=0.45)
         self.obstacles.append(Obstacle(x, y, 0.3))
-
-
-def _wall(start: Point, end: Point, texture: int, trim: int) -> Wall:
-    """Return the wall from ``start`` (left, seen from the front) to ``end``."""
-    return Wall.between(np.array(start), np.array(end), texture, trim, _HEIGHT_M)
 
 
 @dataclass(frozen=True)
@@ -197,8 +193,7 @@ _ORDER = (0, 3, 1, 2)  # of the walls, for numbering their posters
 
 
 def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
-    """Build a room of a kind in its frame, x and y from 0 to ROOM_M; ``owner`` is the label of its
-    individual objects."""
+    """Build a room, x and y from 0 to ROOM_M; ``owner`` labels its individual objects."""
     parts, built = Parts(recipes, (0.0, 0.0), ROOM_M), _KINDS[kind]
     width, depth = ROOM_M
     parts.floor_and_ceiling(kind)
@@ -208,17 +203,17 @@ def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
     for number, material in enumerate(built.materials):
         size_m = (depth if number % 2 else width, _HEIGHT_M)
         texture = recipes.material(material, size_m, kind, number)
-        walls.append(_wall(corners[number], corners[number + 1], texture, trim))
+        walls.append(parts.wall(corners[number], corners[number + 1], texture, trim))
     back, right, front, left = walls
     lefts, across, low, high = built.windows
     glass = recipes.thing("window", kind)
     windows = [Opening(x, x + across, low, high, 0.12, glass) for x in lefts]
-    back.storey(parts.shared, (0, _HEIGHT_M), windows)
+    back.storey((0, _HEIGHT_M), windows)
     x = width - _DOOR_X - _DOOR_M[0]
     door = Opening(x, x + _DOOR_M[0], 0.0, _DOOR_M[1], WALL_THICKNESS_M, PASSAGE)
-    front.storey(parts.shared, (0, _HEIGHT_M), [door])
+    front.storey((0, _HEIGHT_M), [door])
     for side in (right, left):
-        side.storey(parts.shared, (0, _HEIGHT_M))
+        side.storey((0, _HEIGHT_M))
     wood, plain = recipes.thing("wood", kind), recipes.thing("plain", kind)
     if kind == "office":
         screen, cloth = recipes.thing("window", "screen"), recipes.thing("plain", "chair")
@@ -238,7 +233,7 @@ def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
                 parts.table((x, y), (1.6, 0.6), wood, plain)
                 parts.chair(x, y - 0.6, cloth)
         board = recipes.thing("shutter", "board")
-        left.block(parts.shared, (1.3, 3.5), (0.9, 2.1), 0.05, front=board, other=plain)
+        left.block((1.3, 3.5), (0.9, 2.1), 0.05, board, plain)
         parts.poster(right, (2.1, 0.9), "seminar", 0, own=False)
     spots = [(walls[number], at) for number in _ORDER for at in built.posters[number]]
     for number, (on, at) in enumerate(spots):
@@ -267,13 +262,14 @@ def build_module(recipes: Recipes, owner: str) -> Parts:
     to_room = 0.5 * (MODULE_M - ROOM_M[0]) + _DOOR_X
     door_x = to_room + 0.5 * _DOOR_M[0]
     sides = (
-        (_wall((0.0, half), (MODULE_M, half), texture, trim), (door_x, half - 0.4)),
-        (_wall((MODULE_M, -half), (0.0, -half), texture, trim), (MODULE_M - door_x, 0.4 - half)),
+        ((0.0, half), (MODULE_M, half), (door_x, half - 0.4)),
+        ((MODULE_M, -half), (0.0, -half), (MODULE_M - door_x, 0.4 - half)),
     )
-    for number, (side, mat) in enumerate(sides):
+    for number, (start, end, mat) in enumerate(sides):
+        side = parts.wall(start, end, texture, trim)
         passage = Opening(to_room, to_room + _DOOR_M[0], 0.0, _DOOR_M[1], 0.0, PASSAGE)
         closed = Opening(4.3, 5.2, 0.0, _DOOR_M[1], 0.08, door)
-        side.storey(parts.shared, (0, _HEIGHT_M), [passage, closed])
+        side.storey((0, _HEIGHT_M), [passage, closed])
         parts.poster(side, (5.9, 0.9), "corridor", own=False)
         parts.rug(mat, (0.9, 0.6), owner, number, "mat")
         for x in (0.2, 3.2):
@@ -293,9 +289,9 @@ def _build_end(recipes: Recipes, owner: str) -> Parts:
     half = CORRIDOR_M / 2
     parts = Parts(recipes, (0.0, -half), (0.0, half))
     texture = recipes.material("plaster", (CORRIDOR_M, _HEIGHT_M), "corridor", "end")
-    end = _wall((0.0, half), (0.0, -half), texture, recipes.thing("plain", "corridor"))
+    end = parts.wall((0.0, half), (0.0, -half), texture, recipes.thing("plain", "corridor"))
     window = Opening(0.2, 1.1, 0.9, 2.3, 0.12, recipes.thing("window", "corridor"))
-    end.storey(parts.shared, (0, _HEIGHT_M), [window])
+    end.storey((0, _HEIGHT_M), [window])
     parts.poster(end, (1.35, 0.9), owner)
     return parts
 
@@ -387,7 +383,6 @@ def _official_frame(seed: int, index: int) -> RigidTransform:
 def _zone(
     seed: int, index: int, name: str, kind: str, parts: Parts, place_from_part: RigidTransform
 ) -> Zone:
-    """Return the zone of a part of floor ``index``."""
     (x0, y0), (x1, y1) = parts.low, parts.high
     corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
     outline = place_from_part.apply(np.column_stack([corners, np.zeros(4)]))[:, :2]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path, PurePosixPath
@@ -20,17 +20,10 @@ from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import (
-    Frame,
-    lamp_lighting,
-    looking_at,
-    noise_seed,
-    write_truth,
-)
+from megloc_twins.frames import Frame, lamp_lighting, looking_at, noise_seed, write_truth
 from megloc_twins.indoor_rooms import MODULE_M, Floor, Zone, build_floor, floor_place
-from megloc_twins.model_files import write_transformation
 from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
-from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream
+from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream, write_lines
 from megloc_twins.portable import product, settled
 from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_twins.render import RenderedFrame, render_frames
@@ -69,20 +62,15 @@ ScanViews = tuple[Floats, list[CoarseView]]
 class InLocTwinOptions(TwinOptions):
     """Contents of InLoc's twin; ``make eval`` uses the defaults."""
 
-    modules: int = Field(
-        default=2, ge=1, le=20, description="corridor sections per floor, each with two rooms"
-    )
+    modules: int = Field(default=2, ge=1, le=20, description="corridor sections with two rooms")
     queries: int = Field(default=48, ge=2, description="query images, both floors")
     cutout_width: int = Field(default=400, ge=40, description="width of cutouts in px")
     cutout_height: int = Field(default=300, ge=30, description="height of cutouts in px")
     query_width: int = Field(default=640, ge=64, description="width of landscape queries in px")
     query_height: int = Field(default=480, ge=48, description="height of landscape queries in px")
-    supersampling: int = Field(
-        default=2, ge=1, le=4, description="samples per pixel and axis of queries; cutouts have one"
-    )
+    supersampling: int = Field(default=2, ge=1, le=4, description="samples per axis; cutouts: 1")
 
     def floors(self) -> list[Floor]:
-        """Return the floors of the building."""
         return [build_floor(self.seed, index, self.modules) for index in range(len(_FLOORS))]
 
 
@@ -97,13 +85,14 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         root, options = Path(root), self.options
-        scans = [
-            _Scan(index, f"{number:03d}", zone.scan_from_place @ floor.place.place_from_world)
-            for index, floor in enumerate(options.floors())
-            for number, zone in enumerate(floor.zones)
-        ]
-        mapping = [frame for scan in scans for frame in _cutouts(options, scan)]
-        queries = build_queries(options)
+        mapping, queries = [], build_queries(options)
+        for index, floor in enumerate(options.floors()):
+            for number, zone in enumerate(floor.zones):
+                scan_from_floor = zone.scan_from_place @ floor.place.place_from_world
+                mapping += _cutouts(options, index, number, scan_from_floor)
+                name, after = _transformation(index, number), scan_from_floor.inverse()
+                before = _displaced(after, stream(options.seed, "inloc", "before", name))
+                _write_transformation(root / name, before, after)
         for frames, samples in ((mapping, 1), (queries, options.supersampling)):
             render_frames(
                 options.world().model_copy(update={"supersampling": samples}),
@@ -112,61 +101,46 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
                 build=partial(floor_place, options.modules),
                 work=work,
             )
-        for scan in scans:
-            after = scan.scan_from_floor.inverse()
-            rng = stream(options.seed, "inloc", "before", scan.transformation)
-            write_transformation(root / scan.transformation, _displaced(after, rng), after)
         write_truth(root, mapping, queries)
         groups = {frame.name: ImageGroup(condition=frame.condition) for frame in queries}
         write_groups(root / GROUND_TRUTH / SIDE_TABLES, groups)
         return {
             "floors": len(_FLOORS),
-            "scans": len(scans),
+            "scans": len(mapping) // (len(YAWS_DEG) * len(PITCHES_DEG)),
             "mapping images": len(mapping),
             "query images": len(queries),
         }
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """A scan of the twin: file names and pose."""
-
-    floor: int
-    number: str
-    scan_from_floor: RigidTransform
-
-    @property
-    def transformation(self) -> str:
-        folder = f"database/alignments/{_FLOORS[self.floor]}/transformations"
-        return f"{folder}/{_BUILDING}_trans_{self.number}.txt"
-
-    def image(self, yaw_deg: int, pitch_deg: int) -> str:
-        name = f"{_BUILDING}_cutout_{self.number}_{yaw_deg}_{pitch_deg}.jpg"
-        return f"database/cutouts/{_FLOORS[self.floor]}/{self.number}/{name}"
+def _transformation(floor: int, number: int) -> str:
+    folder = f"database/alignments/{_FLOORS[floor]}/transformations"
+    return f"{folder}/{_BUILDING}_trans_{number:03d}.txt"
 
 
-def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
+def _cutouts(
+    options: InLocTwinOptions, floor: int, number: int, scan_from_floor: RigidTransform
+) -> list[Frame]:
     frames: list[Frame] = []
     camera = cutout_camera(options.cutout_width, options.cutout_height)
-    for yaw in YAWS_DEG:
-        for pitch in PITCHES_DEG:
-            name = scan.image(yaw, pitch)
-            # a panorama has a single exposure
-            rng = stream(options.seed, "inloc", "light", scan.transformation)
-            frames.append(
-                Frame(
-                    name=name,
-                    role="mapping",
-                    condition=_FLOORS[scan.floor],
-                    place=scan.floor,
-                    timestamp=len(frames) + 1000 * int(scan.number) + 1_000_000 * scan.floor,
-                    sensor_id="cutout",
-                    camera=camera,
-                    cam_from_world=cam_from_scan(yaw, pitch) @ scan.scan_from_floor,
-                    lighting=lamp_lighting(rng, noise=1.0),
-                    noise_seed=noise_seed(options.seed, name),
-                )
+    folder = f"database/cutouts/{_FLOORS[floor]}/{number:03d}"
+    for yaw, pitch in itertools.product(YAWS_DEG, PITCHES_DEG):
+        name = f"{folder}/{_BUILDING}_cutout_{number:03d}_{yaw}_{pitch}.jpg"
+        # a panorama has a single exposure
+        rng = stream(options.seed, "inloc", "light", _transformation(floor, number))
+        frames.append(
+            Frame(
+                name=name,
+                role="mapping",
+                condition=_FLOORS[floor],
+                place=floor,
+                timestamp=len(frames) + 1000 * number + 1_000_000 * floor,
+                sensor_id="cutout",
+                camera=camera,
+                cam_from_world=cam_from_scan(yaw, pitch) @ scan_from_floor,
+                lighting=lamp_lighting(rng, noise=1.0),
+                noise_seed=noise_seed(options.seed, name),
             )
+        )
     return frames
 
 
@@ -177,6 +151,15 @@ def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform
     turn = RigidTransform((w, 0.0, 0.0, z), (0.0, 0.0, 0.0))
     x, y, z = (float(v) for v in rng.normal(0, 0.08, 3))
     return RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z)) @ pose @ turn
+
+
+def _write_transformation(path: Path, before: RigidTransform, after: RigidTransform) -> None:
+    """Write both matrices in the published form, each under its heading."""
+    lines = []
+    for heading, pose in (("Before general icp:", before), ("After general icp:", after)):
+        rows = (" ".join(f"{value:13.9f}" for value in row) for row in pose.matrix())
+        lines += [heading, *rows, ""]
+    write_lines(path, lines, last_line_ends=False)
 
 
 def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: RenderedFrame) -> None:
@@ -203,8 +186,7 @@ def scanned_points(
     image: NDArray[np.uint8],
     rng: np.random.Generator,
 ) -> Floats:
-    """Return the scanned point of each pixel of a cutout, float64 (H, W, 3), metres in the scan's
-    frame.
+    """Return the scanned point of each pixel of a cutout, (H, W, 3), metres in the scan's frame.
 
     Pixels without a return are NaN: on glass, where ``image``, uint8 (H, W, 3), is dark, far away,
     at grazing angles and at random. The noise is a millimetre along the beam. Values are rounded to
@@ -291,8 +273,7 @@ def _query_poses(
     scans: Sequence[Sequence[ScanViews]],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, tuple[RigidTransform, float]]]:
-    """Yield misfit, pose and yaw of random poses in a zone of floor ``index``; most poses with a
-    larger misfit than an earlier pose are skipped."""
+    """Yield misfit, pose and yaw of random poses in a zone; worse ones are mostly skipped."""
     floor, plan = floors[index], zone.plan
     copies = list(_copies(floors, index, zone))
     least = np.inf
@@ -325,8 +306,7 @@ def _query_poses(
 def _copies(
     floors: Sequence[Floor], index: int, zone: Zone
 ) -> Iterator[tuple[int, RigidTransform]]:
-    """Yield floor and transform from the zone to each other zone of its kind; for corridors also
-    rotated by 180 degrees."""
+    """Yield floor and transform to each zone of the kind; for corridors also a half turn."""
     half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (MODULE_M, 0.0, 0.0))
     for other_index, floor in enumerate(floors):
         for other in floor.zones:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -63,24 +64,19 @@ class FloorPlan:
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
         """Return True if a circle of radius ``margin`` around (x, y) meets no wall or obstacle."""
-        return (
-            self._is_inside(x, y)
-            and _distance_to_ring(x, y, self.outline) >= margin
-            and all(np.hypot(x - o.x, y - o.y) >= o.radius + margin for o in self.obstacles)
+        return _distance_inside(x, y, self.outline) >= margin and all(
+            np.hypot(x - o.x, y - o.y) >= o.radius + margin for o in self.obstacles
         )
 
     def distance_to_path(self, x: float, y: float) -> float:
-        """Return the distance of (x, y) from the mapping rig's path."""
-        return _distance_to_ring(x, y, self.path)
+        return abs(_distance_inside(x, y, self.path))
 
     @property
     def path_length_m(self) -> float:
-        """Return the length of the rig's path."""
         return float(np.hypot(*(np.roll(self.path, -1, axis=0) - self.path).T).sum())
 
     def on_path(self, distance_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Return positions (..., 2) at distances (...) along the path, and the headings
-        (radians)."""
+        """Return positions (..., 2) and headings (radians) at distances (...) along the path."""
         along = np.roll(self.path, -1, axis=0) - self.path
         lengths = np.hypot(*along.T)
         ends = np.cumsum(lengths)
@@ -95,13 +91,6 @@ class FloorPlan:
         spots, headings = self.on_path((np.arange(count) + 0.5) / count * self.path_length_m)
         return list(zip(spots, headings.tolist(), strict=True))
 
-    def _is_inside(self, x: float, y: float) -> bool:
-        start, end = self.outline, np.roll(self.outline, -1, axis=0)
-        crosses = (start[:, 1] > y) != (end[:, 1] > y)
-        rise = np.where(crosses, end[:, 1] - start[:, 1], 1.0)
-        at = start[:, 0] + (y - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
-        return np.count_nonzero(crosses & (x < at)) % 2 == 1
-
 
 def draw_floor_plan(rng: np.random.Generator, index: int) -> FloorPlan:
     """Return the empty floor plan of place ``index``: one of four shapes, slightly stretched."""
@@ -110,10 +99,9 @@ def draw_floor_plan(rng: np.random.Generator, index: int) -> FloorPlan:
     return FloorPlan(outline * stretch, path * stretch)
 
 
-def _distance_to_ring(x: float, y: float, ring: Floats) -> float:
-    along = np.roll(ring, -1, axis=0) - ring
-    part = np.clip((((x, y) - ring) * along).sum(1) / (along**2).sum(1), 0, 1)
-    return float(np.hypot(*(ring + part[:, None] * along - (x, y)).T).min())
+def _distance_inside(x: float, y: float, ring: Floats) -> float:
+    """Return the distance of (x, y) from a polygon, negative outside it."""
+    return cv2.pointPolygonTest(ring.astype(np.float32), (x, y), True)
 
 
 @dataclass(frozen=True)
@@ -130,13 +118,11 @@ class MovingObject:
 
     @property
     def radius_m(self) -> float:
-        """Return the radius of its circle on the ground."""
         return 0.4 if self.kind == "person" else 2.2
 
 
 def moving_object_recipes(seed: int) -> list[TextureRecipe]:
-    """Return the textures of all moving objects; they are first in every place, so their indices
-    are equal."""
+    """Return the textures of all moving objects, which are the first of every place."""
     number = seed_of(seed, "movers")
     recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
     for i in range(NUM_CARS):

@@ -28,7 +28,6 @@ class TwinOptions(Options):
     supersampling: int = Field(default=2, ge=1, le=4, description="samples per pixel and axis")
 
     def world(self) -> SyntheticWorldOptions:
-        """Options of the rendered world."""
         names = SyntheticWorldOptions.model_fields.keys() & type(self).model_fields.keys()
         return SyntheticWorldOptions(**self.model_dump(include=names))
 
@@ -41,52 +40,31 @@ class SyntheticWorldOptions(TwinOptions):
     """
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
-    stations_per_place: int = Field(
-        default=9, ge=3, description="stops of the mapping rig in each place"
-    )
+    stations_per_place: int = Field(default=9, ge=3, description="stops of the mapping rig")
     day_queries: int = Field(default=24, ge=0, description="query images by day, all places")
     night_queries: int = Field(default=24, ge=0, description="query images at night, all places")
     width: int = Field(default=640, ge=64, description="image width in px")
     height: int = Field(default=480, ge=48, description="image height in px")
-    repetition: float = Field(
-        default=0.6,
-        ge=0,
-        le=1,
-        description="share of posters, doors and windows that are equal in all places",
-    )
-    moving_objects: int = Field(
-        default=2, ge=0, description="people and cars around each rig stop and query"
-    )
-    night_exposure: float = Field(
-        default=1.0, gt=0, description="light that reaches the sensor at night, relative"
-    )
+    moving_objects: int = Field(default=2, ge=0, description="people and cars near a camera")
     depth: bool = Field(default=False, description="write depth maps of the mapping images")
     masks: bool = Field(default=False, description="write masks of the bonnet")
 
 
 def stream(seed: int, *labels: str | int) -> np.random.Generator:
-    """Return the random generator of an object or choice with these ``labels``.
-
-    Generators are independent, so an additional query or poster does not change the rest of the
-    world.
-    """
+    """Return the generator of an object or choice with these ``labels``, independent of others."""
     return np.random.default_rng([seed, crc32("/".join(map(str, labels)).encode())])
 
 
 def seed_of(seed: int, *labels: str | int) -> int:
-    """Return a seed by labels; see :func:`stream`."""
+    """Return the seed of an object with these ``labels``."""
     return int(stream(seed, *labels).integers(2**31))
 
 
 class SyntheticDataset(ABC, Generic[OptionsT]):
-    """A dataset rendered from its options; group ``megloc_kapture.rendered_datasets``.
-
-    ``options`` have the class's type ``Options``; None means the defaults.
-    """
+    """A dataset rendered from its options; group ``megloc_kapture.rendered_datasets``."""
 
     Options: ClassVar[type[Options]]
-    version: ClassVar[int]
-    """Version of the files; increase it when equal options give different files."""
+    version: ClassVar[int]  # of the files; increase it when equal options give different files
     options: OptionsT
 
     def __init__(self, options: OptionsT | None = None) -> None:
@@ -97,34 +75,15 @@ class SyntheticDataset(ABC, Generic[OptionsT]):
         """Render the dataset, write it below ``root`` and return counts.
 
         The bytes depend on the options only. All processes of ``work`` must share a file system.
-
-        Raises OutputError if a file cannot be written.
         """
 
 
-class ModelTwinOptions(TwinOptions):
-    """Options of a twin with a sparse model."""
-
-    points_per_image: int = Field(
-        default=100, ge=1, description="random points per image for the sparse models"
-    )
-    night_exposure: float = Field(
-        default=1.0, gt=0, description="light that reaches the sensor at night, relative"
-    )
-    model_features: bool = Field(
-        default=False,
-        description="build sparse models from SIFT features, with a database, instead of exact "
-        "points",
-    )
-
-
 def shuffled(items: Sequence[Item], seed: int, *labels: str) -> list[Item]:
-    """Shuffle the items, as in published files; equal labels give equal orders."""
+    """Return the items in an order that depends on seed and labels, as in published files."""
     return [items[index] for index in stream(seed, *labels).permutation(len(items))]
 
 
 def write_lines(
     path: Path, lines: Sequence[str], *, line_end: str = "\n", last_line_ends: bool = True
 ) -> None:
-    """Write a text file; raises OutputError."""
     write_bytes(path, (line_end.join(lines) + line_end * last_line_ends).encode())

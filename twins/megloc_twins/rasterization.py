@@ -38,7 +38,6 @@ class SampleGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return the rows and columns of samples."""
         return self.camera.height * self.supersampling, self.camera.width * self.supersampling
 
     def rays(self) -> Float64:
@@ -61,10 +60,7 @@ class Visibility:
 
 
 def intrinsics(camera: Camera) -> tuple[float, float, float, float, float]:
-    """Return (fx, fy, cx, cy, k) of a camera; k is SIMPLE_RADIAL's distortion, else 0.
-
-    Raises DataError for a camera model that the renderer does not support.
-    """
+    """Return (fx, fy, cx, cy, k) of a camera; k is SIMPLE_RADIAL's distortion, else 0."""
     if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL"):
         raise DataError(f"the renderer has no camera model {camera.model}")
     p = camera.params
@@ -145,8 +141,7 @@ def _cover(
 
 
 def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64, NDArray[np.bool_]]:
-    """Return linear forms (N, 3, 3) of 1/z, u/z, v/z in the ray, and a mask of surfaces that face
-    the camera."""
+    """Return forms (N, 3, 3) of 1/z, u/z, v/z, and a mask of surfaces that face the camera."""
     normal = np.cross(edge_u, edge_v)  # away from a viewer in front
     offset = np.einsum("ni,ni->n", normal, origin)
     facing = offset > 1e-9
@@ -197,8 +192,7 @@ def depth_map(seen: Visibility) -> Float32:
 
 
 def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32:
-    """Return the colour of each sample, float32 (rows, columns, 3), RGB 0..255; 0 without a
-    surface.
+    """Return the colour of each sample, (rows, columns, 3), RGB 0..255; 0 without a surface.
 
     The texture level is chosen by the area of a sample in texels; two levels are blended.
     """

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import chain
+from operator import itemgetter
 from typing import TypeVar
 
 import cv2
@@ -41,7 +43,6 @@ Mask = NDArray[np.bool_]
 
 _FRAMES_PER_BATCH = 13  # each batch paints the textures, which takes as long as four frames
 _BONNET_COVERS = 0.5  # covered share of a pixel above which mask and depth exclude it
-_BONNET_TOUCHES = 1e-6  # smallest covered share of a pixel that the bonnet touches
 
 _SHADOW_SIZE = 1024
 _BIAS_M = 0.05  # prevents surfaces from shading themselves
@@ -71,7 +72,7 @@ class ShadowMap:
 
 
 def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
-    """Compute the shadow map of surfaces; front and back cast shadows."""
+    """Return the shadow map of surfaces, whose fronts and backs cast shadows."""
     sun = np.array(sun_direction)
     side = np.cross([0.0, 0.0, 1.0] if abs(sun[2]) < 0.99 else [1.0, 0.0, 0.0], sun)
     side /= np.sqrt((side * side).sum())
@@ -110,105 +111,8 @@ def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
     return replace(shadows, height=height)
 
 
-def cloud_texture(seed: int) -> Float32:
-    """Paint clouds, float32 (_CLOUD_SIZE, _CLOUD_SIZE) 0..1, seamless from left to right."""
-    noise = periodic_noise(stream(seed, "clouds"), _CLOUD_SIZE, cell=160, octaves=5)
-    return np.clip(0.5 + 0.5 * noise, 0, 1).astype(np.float32)
-
-
 def _rgb(values: Triple) -> Float32:
     return np.array(values, np.float32)
-
-
-def radiance(
-    seen: Visibility,
-    surfaces: Surfaces,
-    colour: Float32,
-    lighting: Lighting,
-    *,
-    cam_from_place: RigidTransform,
-    lamps: NDArray[np.float64],
-    shadows: ShadowMap | None,
-    clouds: Float32,
-) -> Float32:
-    """Return the linear light along each sample's ray, float32 (rows, columns, 3).
-
-    ``colour``, float32 (rows, columns, 3), is 0..255 with gamma 2, as textures are painted.
-    Surfaces and ``lamps``, float64 (L, 3), are in the place's frame, metres. Without ``shadows``
-    the sun lights every surface that faces it.
-    """
-    index = np.maximum(seen.surface, 0).astype(np.int32)
-    albedo = (colour * np.float32(1 / 255)) ** 2
-    normals = surfaces.normals()
-    ambient = 0.62 + 0.38 * normals[:, 2]
-    light = np.take(ambient.astype(np.float32), index)[..., None] * _rgb(lighting.sky)
-    has_sun, has_lamps = any(lighting.sun), any(lighting.lamps) and len(lamps) > 0
-    if has_sun or has_lamps:
-        x, y, z = _positions(seen, cam_from_place)
-    if has_sun:
-        facing = np.clip(product(normals, np.array(lighting.sun_direction)), 0, None)
-        sun = np.take(facing.astype(np.float32), index)
-        if shadows is not None:
-            sun = sun * shadows.lit(x, y, z)
-        light += sun[..., None] * _rgb(lighting.sun)
-    if has_lamps:
-        normal = np.take(normals.astype(np.float32), index, axis=0)
-        lamp_lighting = _lamp_light((x, y, z), normal, lamps.astype(np.float32))
-        light += lamp_lighting[..., None] * _rgb(lighting.lamps)
-    light += np.take(surfaces.glow, index)[..., None] * _rgb(lighting.glow)
-    result = albedo * light
-    sky = seen.surface == NO_SURFACE
-    if sky.any():
-        result[sky] = _sky(seen, sky, lighting, cam_from_place, clouds)
-    return result
-
-
-def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
-    """Return x, y, z of each sample's surface point in the place's frame, metres; those of the
-    camera without a surface."""
-    rotation = cam_from_place.rotation_matrix().astype(np.float32)
-    center = cam_from_place.center().astype(np.float32)
-    hit = seen.inverse_depth > 0
-    depth = np.where(hit, 1 / np.where(hit, seen.inverse_depth, 1), 0).astype(np.float32)
-    gx, gy = seen.grid.x.astype(np.float32), seen.grid.y.astype(np.float32)
-    return tuple(
-        center[i] + depth * (rotation[0, i] * gx + rotation[1, i] * gy + rotation[2, i])
-        for i in range(3)
-    )
-
-
-def _lamp_light(position: tuple[Float32, ...], normal: Float32, lamps: Float32) -> Float32:
-    """Sum cosine over squared distance over all lamps, cut off smoothly at _LAMP_RANGE_M."""
-    total = np.zeros_like(position[0])
-    for lamp in lamps:
-        dx, dy, dz = (lamp[i] - position[i] for i in range(3))
-        squared = dx * dx + dy * dy + dz * dz
-        facing = dx * normal[..., 0] + dy * normal[..., 1] + dz * normal[..., 2]
-        fade = np.clip(1 - squared * np.float32(_LAMP_RANGE_M**-2), 0, None)
-        total += np.clip(facing, 0, None) * fade / (squared * np.sqrt(squared) + np.float32(0.3))
-    return total
-
-
-def _sky(
-    seen: Visibility,
-    where: Mask,
-    lighting: Lighting,
-    cam_from_place: RigidTransform,
-    clouds: Float32,
-) -> Float32:
-    rotation = cam_from_place.rotation_matrix().astype(np.float32)
-    gx = np.broadcast_to(seen.grid.x, where.shape)[where].astype(np.float32)
-    gy = np.broadcast_to(seen.grid.y, where.shape)[where].astype(np.float32)
-    rays = gx[:, None] * rotation[0] + gy[:, None] * rotation[1] + rotation[2]
-    azimuth = arctan2(rays[:, 1], rays[:, 0]) + np.float32(lighting.cloud_shift)
-    rise = rays[:, 2] / np.sqrt(rays[:, 0] * rays[:, 0] + rays[:, 1] * rays[:, 1])
-    u = np.mod(azimuth * np.float32(_CLOUD_SIZE / (2 * np.pi)), _CLOUD_SIZE)
-    v = np.clip(rise, 0, 3) * np.float32(_CLOUD_SIZE / 3.2)
-    seamless = np.concatenate([clouds, clouds[:, :1]], axis=1)[..., None]
-    cover = bilinear(seamless, u[None], v[None])[0]
-    base = _rgb(lighting.sky_colour)
-    haze = exp(-3 * np.clip(rise, 0, None))[:, None] * base.mean() * np.float32(0.5)
-    return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
 
 
 def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDArray[np.uint8]:
@@ -292,44 +196,44 @@ class RenderedFrame:
 
 
 def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
-    """Return the texture atlas."""
     return build_atlas([recipe.paint() for recipe in recipes])
 
 
 class PlaceRenderer:
-    """Renderer of the frames of one place; painting its textures takes about a second."""
+    """Renderer of the frames of one place; painting its textures takes about a second.
+
+    ``seed`` determines the clouds and the dirt on the bonnet.
+    """
 
     def __init__(self, place: Place, *, seed: int, supersampling: int) -> None:
         self._place = place
         self._seed = seed
         self._supersampling = supersampling
         self._atlas = painted(place.recipes)
-        self._clouds = cloud_texture(seed)
+        noise = periodic_noise(stream(seed, "clouds"), _CLOUD_SIZE, cell=160, octaves=5)
+        # share of light from clouds, seamless from left to right
+        self._clouds = np.clip(0.5 + 0.5 * noise, 0, 1).astype(np.float32)
         self._shadows: tuple[Triple, ShadowMap] | None = None
 
     def render(self, frame: Frame, *, depth: bool = False) -> RenderedFrame:
         """Render one frame, with its depth if requested."""
-        place, lighting = self._place, frame.lighting
         moving_objects = moving_object_surfaces(frame.moving_objects)
-        surfaces = place.surfaces.joined(moving_objects)
-        cam_from_place = place.cam_from_place(frame)
-        grid = sample_grid(frame.camera, self._supersampling)
-        seen = visible_surfaces(surfaces, cam_from_place, grid)
-        shadows = None
-        if any(lighting.sun):
-            shadows = add_shadows(self._static_shadows(lighting.sun_direction), moving_objects)
-        light = radiance(
-            seen,
-            surfaces,
-            sample_colour(seen, surfaces, self._atlas),
-            lighting,
-            cam_from_place=cam_from_place,
-            lamps=place.lamps,
-            shadows=shadows,
-            clouds=self._clouds,
+        surfaces = self._place.surfaces.joined(moving_objects)
+        cam_from_place = self._place.cam_from_place(frame)
+        seen = visible_surfaces(
+            surfaces, cam_from_place, sample_grid(frame.camera, self._supersampling)
         )
+        shadows = None
+        if any(frame.lighting.sun):
+            shadows = add_shadows(
+                self._static_shadows(frame.lighting.sun_direction), moving_objects
+            )
+        light = self._radiance(seen, surfaces, frame.lighting, cam_from_place, shadows)
         image = develop(light, frame, self._supersampling, self._seed)
-        mask = _bonnet_cover(frame, self._seed) < _BONNET_COVERS
+        width, height = frame.camera.width, frame.camera.height
+        mask = np.ones((height, width), bool)
+        if frame.bonnet:
+            mask = bonnet(width, height, self._seed)[0] < _BONNET_COVERS
         depth_m = None
         if depth:
             if self._supersampling > 1:
@@ -339,11 +243,85 @@ class PlaceRenderer:
         return RenderedFrame(image, depth_m, mask)
 
     def _static_shadows(self, sun: Triple) -> ShadowMap:
-        """Return the shadow map of the static surfaces; the last one is cached, because consecutive
-        frames often have the same sun."""
+        # consecutive frames often have the same sun
         if self._shadows is None or self._shadows[0] != sun:
             self._shadows = (sun, cast_shadows(self._place.surfaces, sun))
         return self._shadows[1]
+
+    def _radiance(
+        self,
+        seen: Visibility,
+        surfaces: Surfaces,
+        lighting: Lighting,
+        cam_from_place: RigidTransform,
+        shadows: ShadowMap | None,
+    ) -> Float32:
+        """Return the linear light along each sample's ray, float32 (rows, columns, 3)."""
+        index = np.maximum(seen.surface, 0).astype(np.int32)
+        # textures are painted with gamma 2
+        albedo = (sample_colour(seen, surfaces, self._atlas) * np.float32(1 / 255)) ** 2
+        normals = surfaces.normals()
+        ambient = 0.62 + 0.38 * normals[:, 2]
+        light = np.take(ambient.astype(np.float32), index)[..., None] * _rgb(lighting.sky)
+        lamps = self._place.lamps if any(lighting.lamps) else ()
+        if shadows is not None or len(lamps):
+            x, y, z = _positions(seen, cam_from_place)
+        if shadows is not None:
+            facing = np.clip(product(normals, np.array(lighting.sun_direction)), 0, None)
+            sun = np.take(facing.astype(np.float32), index) * shadows.lit(x, y, z)
+            light += sun[..., None] * _rgb(lighting.sun)
+        if len(lamps):
+            normal = np.take(normals.astype(np.float32), index, axis=0)
+            of_lamps = _lamp_light((x, y, z), normal, np.asarray(lamps, np.float32))
+            light += of_lamps[..., None] * _rgb(lighting.lamps)
+        light += np.take(surfaces.glow, index)[..., None] * _rgb(lighting.glow)
+        result = albedo * light
+        sky = seen.surface == NO_SURFACE
+        if sky.any():
+            result[sky] = self._sky(seen, sky, lighting, cam_from_place)
+        return result
+
+    def _sky(
+        self, seen: Visibility, where: Mask, lighting: Lighting, cam_from_place: RigidTransform
+    ) -> Float32:
+        rotation = cam_from_place.rotation_matrix().astype(np.float32)
+        gx = np.broadcast_to(seen.grid.x, where.shape)[where].astype(np.float32)
+        gy = np.broadcast_to(seen.grid.y, where.shape)[where].astype(np.float32)
+        rays = gx[:, None] * rotation[0] + gy[:, None] * rotation[1] + rotation[2]
+        azimuth = arctan2(rays[:, 1], rays[:, 0]) + np.float32(lighting.cloud_shift)
+        rise = rays[:, 2] / np.sqrt(rays[:, 0] * rays[:, 0] + rays[:, 1] * rays[:, 1])
+        u = np.mod(azimuth * np.float32(_CLOUD_SIZE / (2 * np.pi)), _CLOUD_SIZE)
+        v = np.clip(rise, 0, 3) * np.float32(_CLOUD_SIZE / 3.2)
+        seamless = np.concatenate([self._clouds, self._clouds[:, :1]], axis=1)[..., None]
+        cover = bilinear(seamless, u[None], v[None])[0]
+        base = _rgb(lighting.sky_colour)
+        haze = exp(-3 * np.clip(rise, 0, None))[:, None] * base.mean() * np.float32(0.5)
+        return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
+
+
+def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
+    """Return x, y, z of each sample's surface point, or of the camera, in the place's frame."""
+    rotation = cam_from_place.rotation_matrix().astype(np.float32)
+    center = cam_from_place.center().astype(np.float32)
+    hit = seen.inverse_depth > 0
+    depth = np.where(hit, 1 / np.where(hit, seen.inverse_depth, 1), 0).astype(np.float32)
+    gx, gy = seen.grid.x.astype(np.float32), seen.grid.y.astype(np.float32)
+    return tuple(
+        center[i] + depth * (rotation[0, i] * gx + rotation[1, i] * gy + rotation[2, i])
+        for i in range(3)
+    )
+
+
+def _lamp_light(position: tuple[Float32, ...], normal: Float32, lamps: Float32) -> Float32:
+    """Sum cosine over squared distance over all lamps, cut off smoothly at _LAMP_RANGE_M."""
+    total = np.zeros_like(position[0])
+    for lamp in lamps:
+        dx, dy, dz = (lamp[i] - position[i] for i in range(3))
+        squared = dx * dx + dy * dy + dz * dz
+        facing = dx * normal[..., 0] + dy * normal[..., 1] + dz * normal[..., 2]
+        fade = np.clip(1 - squared * np.float32(_LAMP_RANGE_M**-2), 0, None)
+        total += np.clip(facing, 0, None) * fade / (squared * np.sqrt(squared) + np.float32(0.3))
+    return total
 
 
 def render_frames(
@@ -360,22 +338,18 @@ def render_frames(
 
     Parameters
     ----------
-    finish : called as ``finish(frame, rendered)`` in the process that rendered the frame, to write
-        the files; must be picklable.
+    finish : called in the process that rendered the frame, to write the files; must be picklable.
     with_depth : names of the frames that need ``depth_m``.
     build : returns the place with an index, the same in every process.
     sky_seed : seed of the clouds and of the dirt on the bonnet; by default that of the world.
     """
     seed = options.seed if sky_seed is None else sky_seed
     render = partial(_render, options, build, seed, frozenset(with_depth), finish)
-    results = (
-        pair for pairs in ordered_map(render, _batches(frames), work.executor) for pair in pairs
-    )
-    return dict(sorted(work.track(results, len(frames), "drawing"), key=lambda pair: pair[0]))
+    results = chain.from_iterable(ordered_map(render, _batches(frames), work.executor))
+    return dict(sorted(work.track(results, len(frames), "drawing"), key=itemgetter(0)))
 
 
 def _batches(frames: Sequence[Frame]) -> Iterator[list[Frame]]:
-    """Group frames by place."""
     for place in sorted({frame.place for frame in frames}):
         here = [frame for frame in frames if frame.place == place]
         for start in range(0, len(here), _FRAMES_PER_BATCH):
@@ -402,23 +376,3 @@ def _render(
         (frame.name, finish(frame, renderer.render(frame, depth=frame.name in with_depth)))
         for frame in frames
     ]
-
-
-def _bonnet_cover(frame: Frame, seed: int) -> Float32:
-    width, height = frame.camera.width, frame.camera.height
-    if not frame.bonnet:
-        return np.zeros((height, width), np.float32)
-    return bonnet(width, height, seed)[0]
-
-
-def on_bonnet(frame: Frame, seed: int) -> Mask:
-    """Return a mask (H, W) of the pixels that the bonnet of a seed covers at least partly."""
-    return _bonnet_cover(frame, seed) > _BONNET_TOUCHES
-
-
-def on_moving_objects(frame: Frame, place: Place) -> Mask:
-    """Return a mask (H, W) of pixels whose centre shows a person or car; ignores the bonnet."""
-    # surfaces of moving objects follow those of the place
-    surfaces = place.surfaces.joined(moving_object_surfaces(frame.moving_objects))
-    seen = visible_surfaces(surfaces, place.cam_from_place(frame), sample_grid(frame.camera, 1))
-    return seen.surface >= len(place.surfaces)

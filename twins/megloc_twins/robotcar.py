@@ -28,28 +28,28 @@ from megloc_twins.frames import (
     road_lighting,
     write_truth,
 )
-from megloc_twins.model_files import write_colmap_text, write_nvm
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import (
-    ModelTwinOptions,
     SyntheticDataset,
     SyntheticWorldOptions,
+    TwinOptions,
     shuffled,
     stream,
     write_lines,
 )
 from megloc_twins.portable import settled_pose
 from megloc_twins.sparse_models import (
-    MapFrames,
+    Depths,
+    exact_tracks,
     nvm_model,
     render_map_and_queries,
-    write_sift_database,
+    write_colmap_model,
+    write_nvm,
 )
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit, views_of
 
 REFERENCE_CONDITION = "overcast-reference"
-CONDITIONS = ("dawn", "overcast-winter", "rain", "sun", "night", "night-rain")
 CAMERAS = ("left", "rear", "right")
 SCORED_CAMERA = "rear"  # also shows the car's boot
 
@@ -60,7 +60,7 @@ OFFICIAL_FROM_WORLD = settled_pose(
 )
 # time of the first image of each traversal, microseconds
 _STARTS_US = {
-    "overcast-reference": 1417176458999821,
+    REFERENCE_CONDITION: 1417176458999821,
     "dawn": 1418721355075498,
     "overcast-winter": 1423840721124367,
     "rain": 1416908241836249,
@@ -68,6 +68,7 @@ _STARTS_US = {
     "night": 1418235223450115,
     "night-rain": 1418840689734892,
 }
+CONDITIONS = tuple(_STARTS_US)[1:]  # of the queries
 _PLACE_US, _STOP_US = 60_000_000, 1_062_501
 _CAMERA_HEIGHT_M = 1.6
 # viewing directions of the cameras, degrees to the right of straight ahead and upwards, and their
@@ -86,16 +87,12 @@ _STEPS = 997  # number of possible positions of a query along the path
 _UNLISTED_CONDITIONS = ("rain", "night-rain")
 
 
-class RobotCarTwinOptions(ModelTwinOptions):
+class RobotCarTwinOptions(TwinOptions):
     """Contents of RobotCar Seasons' twin; ``make eval`` uses the defaults."""
 
     num_locations: int = Field(default=3, ge=1, description="locations, at least 60 m apart")
-    stops_per_location: int = Field(
-        default=12, ge=3, description="moments of the reference traversal in each location"
-    )
-    moments_per_condition: int = Field(
-        default=8, ge=2, description="moments of each other traversal, all locations"
-    )
+    stops_per_location: int = Field(default=12, ge=3, description="moments of the map in each")
+    moments_per_condition: int = Field(default=8, ge=2, description="of each other traversal")
     size_px: int = Field(default=512, ge=64, description="width and height of an image")
 
     def world(self) -> SyntheticWorldOptions:
@@ -112,23 +109,20 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
     ``./``; the test list omits the conditions; some reference images are in no model and some
     queries in neither list of version 2; lists end with a blank line, have CRLF line breaks or lack
     the last line break.
-    With ``model_features`` also ``3D-models/overcast-reference.db``, the features of the models.
     """
 
     Options = RobotCarTwinOptions
-    version = 2
+    version = 3
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         layout, options = Layout(Path(root)), self.options
         frames = build_robotcar_frames(options)
-        images = layout.images
-        drawn = render_map_and_queries(options, frames.mapping, frames.queries, images, work)
+        depths_m = render_map_and_queries(
+            options, frames.mapping, frames.queries, layout.images, work
+        )
         registered = in_frame(_registered(frames.mapping), OFFICIAL_FROM_WORLD)
         queries = in_frame(frames.queries, OFFICIAL_FROM_WORLD)
-        _write_models(layout, options, registered, drawn)
-        if options.model_features:
-            named = {_png(frame.name): frame for frame in frames.mapping}
-            write_sift_database(layout.feature_database, named, drawn.features)
+        _write_models(layout, options, registered, depths_m)
         _write_car(layout, options)
         _write_query_lists(layout, queries)
         _write_version_2(layout, options, queries)
@@ -218,9 +212,7 @@ def _moment(
     frames = []
     for camera, intrinsics in car_cameras(options.size_px).items():
         name = f"{condition}/{camera}/{timestamp}.jpg"
-        lighting = road_lighting(
-            condition, rng, azimuth=azimuth, night_exposure=options.night_exposure
-        )
+        lighting = road_lighting(condition, rng, azimuth=azimuth)
         frames.append(
             Frame(
                 name=name,
@@ -246,8 +238,7 @@ def _query_poses(
     map_views: list[CoarseView],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, RigidTransform]]:
-    """Yield ``car_from_place`` near the reference traversal, preceded by the misfit of the scored
-    camera's view."""
+    """Yield the misfit of the scored camera's view and ``car_from_place``, near the map's path."""
     camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], CAM_FROM_CAR[SCORED_CAMERA]
     path = place.plan.stops(_STEPS)
     for _ in range(_ATTEMPTS):
@@ -264,8 +255,7 @@ def _query_poses(
 def _car_from_place(
     spot: NDArray[np.float64], yaw: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """Return the pose of a slightly tilted car at a position (2,), metres, driving along
-    ``yaw``."""
+    """Return the pose of a slightly tilted car at a position (2,) that drives along ``yaw``."""
     pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
     height = _CAMERA_HEIGHT_M + float(rng.normal(0, 0.02))
     return looking_at(np.array([*spot, height]), float(yaw), pitch, roll)
@@ -282,7 +272,7 @@ def _registered(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def _write_models(
-    layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], drawn: MapFrames
+    layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], depths_m: Depths
 ) -> None:
     """Write one model per location and a merged model, in the same coordinates."""
     places = np.array([frame.place for frame in frames])
@@ -291,8 +281,9 @@ def _write_models(
         positions = np.flatnonzero(places == place).tolist()
         here = [frames[position] for position in positions]
         rng = stream(options.seed, "robotcar", "points", place)
-        points = drawn.points(here, rng)
-        write_colmap_text(layout.individual_model(_location(place)), _colmap_model(here, points))
+        points = exact_tracks(here, depths_m, rng)
+        model = _colmap_model(here, points)
+        write_colmap_model(layout.individual_model(_location(place)), model, text=True)
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))
     names = [f"./{_png(frame.name)}" for frame in frames]
@@ -342,8 +333,7 @@ def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
 def _write_version_2(
     layout: Layout, options: RobotCarTwinOptions, queries: Sequence[Frame]
 ) -> None:
-    """Write version 2's lists: half of each traversal's moments with poses, half without; a few
-    moments are in neither list."""
+    """Write version 2's lists: half of each traversal's moments have poses, a few are missing."""
     train: list[Frame] = []
     test: list[Frame] = []
     scored = [frame for frame in queries if frame.sensor_id == SCORED_CAMERA]
@@ -363,7 +353,6 @@ def _write_version_2(
 
 
 def _location(place: int) -> str:
-    """Format a location's number as in file names."""
     return f"{place + 1:03d}"
 
 

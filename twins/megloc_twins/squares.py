@@ -8,7 +8,7 @@ matching hard.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from megloc_twins.frames import Frame
 from megloc_twins.moving_objects import FloorPlan, Obstacle, draw_floor_plan, moving_object_recipes
 from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
 from megloc_twins.portable import settled_pose
-from megloc_twins.surfaces import Opening, Span, SurfaceBuilder, Surfaces, Vector, Wall
+from megloc_twins.surfaces import Opening, SurfaceBuilder, Surfaces, Vector, Wall
 from megloc_twins.textures import GROUND_TEXELS_PER_M, TextureRecipe, index_of, texels
 
 Point = tuple[float, float]
@@ -36,6 +36,7 @@ _MAX_FURNITURE = 8
 _PLACE_DISTANCE_M = 90.0  # between centres of neighbouring places, before a random shift
 _WALL_TEXELS_PER_M = 100
 _MATERIALS = ("brick", "stone", "plaster")
+_SHARED = 0.6  # of posters, doors and windows, which are equal in all places
 _TEXTURES = {  # width, height in texels; number of shared textures and of those of each place
     "window": (156, 192, 3, 3),
     "door": (132, 270, 2, 3),
@@ -115,7 +116,6 @@ class Furniture:
 class Facade:
     """Facade of a house: a wall with windows, doors and attachments."""
 
-    builder: SurfaceBuilder
     wall: Wall
     rng: np.random.Generator
     pick: TexturePicker
@@ -132,23 +132,23 @@ class Facade:
             self._ground_bay(left, right, ground)
             if rng.random() < 0.85:
                 self._upper_window(left, right, window, upper)
-        wall.storey(self.builder, (0.0, _GROUND_STOREY_M), ground)
-        wall.storey(self.builder, (_GROUND_STOREY_M, _EAVES_M), upper)
-        self._block((0.0, wall.length), (_EAVES_M, _WALL_HEIGHT_M), 0.25, wall.trim, wall.trim)
+        wall.storey((0.0, _GROUND_STOREY_M), ground)
+        wall.storey((_GROUND_STOREY_M, _EAVES_M), upper)
+        wall.block((0.0, wall.length), (_EAVES_M, _WALL_HEIGHT_M), 0.25, wall.trim, wall.trim)
         for edge in edges[1:-1]:
             draw = rng.random()
             if draw < 0.35:  # pilaster
                 span = (float(edge) - 0.18, float(edge) + 0.18)
-                self._block(span, (0.0, _EAVES_M), 0.16, wall.texture, wall.trim)
+                self.wall.block(span, (0.0, _EAVES_M), 0.16, wall.texture, wall.trim)
             elif draw < 0.5:  # drain pipe
                 span = (float(edge) - 0.05, float(edge) + 0.05)
                 pipe = self.pick("plain")
-                self._block(span, (0.0, _EAVES_M), 0.1, pipe, pipe)
+                self.wall.block(span, (0.0, _EAVES_M), 0.1, pipe, pipe)
         lamps = []
         for x in np.arange(rng.uniform(1.5, 3.5), wall.length - 1, rng.uniform(4.5, 7.0)).tolist():
             glow = self.pick("glow")
             span = (x - 0.13, x + 0.13)
-            wall.block(self.builder, span, (2.95, 3.25), 0.24, front=glow, other=glow, glow=4.0)
+            wall.block(span, (2.95, 3.25), 0.24, glow, glow, glow=4.0)
             lamps.append(wall.point(x, 3.1, 0.45))
         return lamps
 
@@ -171,7 +171,7 @@ class Facade:
             half = min(0.95, (right - left) / 2 - 0.1)
             depth = rng.uniform(0.06, 0.2)
             span = (middle - half, middle + half)
-            self._block(span, (2.62, 2.62 + 0.5), depth, self.pick("sign"), self.wall.trim)
+            self.wall.block(span, (2.62, 2.62 + 0.5), depth, self.pick("sign"), self.wall.trim)
 
     def _upper_window(
         self, left: float, right: float, common: int, openings: list[Opening]
@@ -184,16 +184,13 @@ class Facade:
         openings.append(hole)
         if rng.random() < 0.3:  # a balcony
             span = (max(0.0, hole.x0 - 0.25), min(self.wall.length, hole.x1 + 0.25))
-            self._block(span, (y0 - 0.55, y0 + 0.2), 0.6, self.pick("wood"), self.pick("plain"))
+            self.wall.block(span, (y0 - 0.55, y0 + 0.2), 0.6, self.pick("wood"), self.pick("plain"))
         else:
             self._ledge(hole)
 
-    def _block(self, x: Span, y: Span, depth: float, front: int, other: int) -> None:
-        self.wall.block(self.builder, x, y, depth, front=front, other=other)
-
     def _ledge(self, hole: Opening) -> None:
         trim = self.wall.trim
-        self._block((hole.x0 - 0.1, hole.x1 + 0.1), (hole.y0 - 0.1, hole.y0), 0.14, trim, trim)
+        self.wall.block((hole.x0 - 0.1, hole.x1 + 0.1), (hole.y0 - 0.1, hole.y0), 0.14, trim, trim)
 
     def _posters(self, x: float, end: float) -> None:
         rng = self.rng
@@ -204,7 +201,7 @@ class Facade:
             base = rng.uniform(0.6, 1.2)
             height = (base, base + width * 1.4)
             depth = rng.uniform(0.02, 0.08)
-            self._block((x, x + width), height, depth, self.pick("poster"), self.wall.trim)
+            self.wall.block((x, x + width), height, depth, self.pick("poster"), self.wall.trim)
             x += width + rng.uniform(0.08, 0.3)
 
 
@@ -221,46 +218,39 @@ class Place:
 
     @property
     def name(self) -> str:
-        """Return the place's name in image paths and tables."""
         return f"place{self.index}"
 
     def cam_from_place(self, frame: Frame) -> RigidTransform:
         """Return the pose of a frame relative to this place."""
         return frame.cam_from_world @ self.place_from_world.inverse()
 
-    def surfaces_in_world(self) -> Surfaces:
-        """Return the surfaces in the world frame."""
-        world_from_place = self.place_from_world.inverse()
-        return self.surfaces.moved(
-            world_from_place.rotation_matrix(), np.array(world_from_place.translation)
-        )
-
 
 @dataclass
 class _TextureStore:
     """Textures of a place by recipe, some of them shared by all places."""
 
-    options: SyntheticWorldOptions
+    seed: int
     place: int
     rng: np.random.Generator
-    recipes: list[TextureRecipe] = field(default_factory=list)
+    recipes: list[TextureRecipe]
 
     def pick(self, kind: str) -> int:
         width, height, num_shared, num_own = _TEXTURES[kind]
-        shared = self.rng.random() < self.options.repetition
+        shared = self.rng.random() < _SHARED
         owner = "shared" if shared else f"place{self.place}"
         number = int(self.rng.integers(num_shared if shared else num_own))
-        seed = seed_of(self.options.seed, owner, kind, number)
+        seed = seed_of(self.seed, owner, kind, number)
         return index_of(TextureRecipe(kind, width, height, seed), self.recipes)
 
     def material(self, painter: str, kind: str, size_m: tuple[float, float], label: str) -> int:
-        density = _WALL_TEXELS_PER_M if painter == "wall" else GROUND_TEXELS_PER_M
-        seed = seed_of(self.options.seed, self.place, label)
-        params: dict[str, str | float] = {"material": kind}
-        params["material_seed"] = seed_of(self.options.seed, "material")
+        density = GROUND_TEXELS_PER_M
+        params: list[tuple[str, str | float]] = [("material", kind)]
+        params.append(("material_seed", seed_of(self.seed, "material")))
         if painter == "wall":
-            params["graffiti"] = float(self.rng.integers(0, 3))
-        recipe = TextureRecipe(painter, *texels(size_m, density), seed, tuple(params.items()))
+            density = _WALL_TEXELS_PER_M
+            params.append(("graffiti", float(self.rng.integers(0, 3))))
+        seed = seed_of(self.seed, self.place, label)
+        recipe = TextureRecipe(painter, *texels(size_m, density), seed, tuple(params))
         return index_of(recipe, self.recipes)
 
 
@@ -268,8 +258,8 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
     """Lay out place ``index`` of a world."""
     rng = stream(options.seed, "layout", index)
     plan = draw_floor_plan(rng, index)
-    store = _TextureStore(options, index, stream(options.seed, "textures", index))
-    store.recipes += moving_object_recipes(options.seed)
+    seed, recipes = options.seed, moving_object_recipes(options.seed)
+    store = _TextureStore(seed, index, stream(seed, "textures", index), recipes)
     builder = SurfaceBuilder()
     lamps: list[Vector] = []
     ends = np.roll(plan.outline, -1, axis=0)
@@ -278,8 +268,9 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
         size_m = (float(np.hypot(*(end - start))), _WALL_HEIGHT_M)
         material = _MATERIALS[int(rng.integers(len(_MATERIALS)))]
         texture = store.material("wall", material, size_m, f"wall{number}")
-        wall = Wall.between(start, end, texture, store.pick("plain"), _WALL_HEIGHT_M)
-        lamps += Facade(builder, wall, rng, store.pick).build()
+        trim = store.pick("plain")
+        wall = Wall.between(builder, (start, end), texture, trim, _WALL_HEIGHT_M)
+        lamps += Facade(wall, rng, store.pick).build()
     low, high = plan.outline.min(0) - 0.5, plan.outline.max(0) + 0.5
     width, depth = (high - low).tolist()
     kind = str(rng.choice(["paving", "asphalt"], p=[0.65, 0.35]))

@@ -59,7 +59,6 @@ class Surfaces:
         )
 
     def joined(self, other: Surfaces) -> Surfaces:
-        """Return these surfaces followed by the others."""
         names = (field.name for field in fields(self))
         return Surfaces(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
@@ -80,7 +79,6 @@ class SurfaceBuilder:
         uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
-        """Add a parallelogram; see :class:`Surfaces`."""
         self._rows.append((origin, edge_u, edge_v, texture, uv, glow))
 
     def add_box(
@@ -96,9 +94,10 @@ class SurfaceBuilder:
         uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
-        """Add an upright box: ``size`` is (along x, along y, height) in metres before the rotation
-        by ``yaw`` (radians); ``sides`` are the textures of the -y, +x, +y and -x faces, each
-        showing the part ``uv``."""
+        """Add an upright box of size (along x, along y, height), rotated by ``yaw``.
+
+        ``sides`` are the textures of the -y, +x, +y and -x faces, each showing the part ``uv``.
+        """
         half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
         cos, sin = np.cos(yaw), np.sin(yaw)
         along = np.array([cos, sin, 0.0])
@@ -118,7 +117,6 @@ class SurfaceBuilder:
             self.add(corner, 2 * half_x * along, 2 * half_y * across, bottom, glow=glow)
 
     def build(self) -> Surfaces:
-        """Return all surfaces, in order."""
         count = len(self._rows)
         columns = list(zip(*self._rows, strict=True)) or [()] * 6
         origin, edge_u, edge_v = (settled(column).reshape(count, 3) for column in columns[:3])
@@ -150,8 +148,9 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """Frame of a wall, which extends from ``start`` to the right, seen from inside the place."""
+    """A wall from ``start`` to the right, seen from inside; its parts are added to ``builder``."""
 
+    builder: SurfaceBuilder
     start: Vector  # (3,), lower left corner, metres
     right: Vector  # (3,), unit vector
     inward: Vector  # (3,), unit vector towards the viewer
@@ -161,26 +160,28 @@ class Wall:
     height: float  # metres
 
     @classmethod
-    def between(cls, start: Vector, end: Vector, texture: int, trim: int, height: float) -> Wall:
-        """Return the wall from ``start`` to ``end``, (2,) each, metres."""
+    def between(
+        cls,
+        builder: SurfaceBuilder,
+        ends: tuple[Vector, Vector],
+        texture: int,
+        trim: int,
+        height: float,
+    ) -> Wall:
+        """Return the wall between two ends, left and right, (2,) each, metres."""
+        start, end = ends
         length = float(np.hypot(*(end - start)))
         right = np.array([*(end - start) / length, 0.0])
         inward = np.array([right[1], -right[0], 0.0])
-        return cls(np.array([*start, 0.0]), right, inward, length, texture, trim, height)
+        start = np.array([*start, 0.0])
+        return cls(builder, start, right, inward, length, texture, trim, height)
 
     def point(self, x: float, y: float, out: float = 0.0) -> Vector:
         """Return the point at ``x`` along, ``y`` above the foot and ``out`` of the wall, metres."""
         return self.start + x * self.right + out * self.inward + np.array([0.0, 0.0, y])
 
     def rectangle(
-        self,
-        builder: SurfaceBuilder,
-        x: Span,
-        y: Span,
-        texture: int,
-        *,
-        out: float = 0.0,
-        glow: float = 0.0,
+        self, x: Span, y: Span, texture: int, *, out: float = 0.0, glow: float = 0.0
     ) -> None:
         """Add a rectangle parallel to the wall, ``out`` metres in front of it."""
         uv = WHOLE
@@ -189,35 +190,26 @@ class Wall:
             uv = (x[0] / across, 1 - y[1] / down, x[1] / across, 1 - y[0] / down)
         edge_u = (x[1] - x[0]) * self.right
         edge_v = np.array([0.0, 0.0, y[0] - y[1]])
-        builder.add(self.point(x[0], y[1], out), edge_u, edge_v, texture, uv=uv, glow=glow)
+        self.builder.add(self.point(x[0], y[1], out), edge_u, edge_v, texture, uv=uv, glow=glow)
 
     def block(
-        self,
-        builder: SurfaceBuilder,
-        x: Span,
-        y: Span,
-        depth: float,
-        *,
-        front: int,
-        other: int,
-        glow: float = 0.0,
+        self, x: Span, y: Span, depth: float, front: int, other: int, *, glow: float = 0.0
     ) -> None:
         """Add a box on the wall, ``depth`` metres thick."""
-        self.rectangle(builder, x, y, front, out=depth, glow=glow)
-        self._frame(builder, x, y, depth, other, glow)
+        self.rectangle(x, y, front, out=depth, glow=glow)
+        self._frame(x, y, depth, other, glow)
 
-    def _frame(
-        self, builder: SurfaceBuilder, x: Span, y: Span, out: float, texture: int, glow: float = 0.0
-    ) -> None:
+    def _frame(self, x: Span, y: Span, out: float, texture: int, glow: float = 0.0) -> None:
         """Add the four sides between the wall and a rectangle ``out`` in front of or behind it."""
         width, outward = (x[1] - x[0]) * self.right, out * self.inward
         down = -(y[1] - y[0]) * np.array([0.0, 0.0, 1.0])
-        builder.add(self.point(x[0], y[1]), outward, down, texture, glow=glow)
-        builder.add(self.point(x[1], y[1], out), -outward, down, texture, glow=glow)
-        builder.add(self.point(x[0], y[1]), width, outward, texture, glow=glow)
-        builder.add(self.point(x[0], y[0], out), width, -outward, texture, glow=glow)
+        add = self.builder.add
+        add(self.point(x[0], y[1]), outward, down, texture, glow=glow)
+        add(self.point(x[1], y[1], out), -outward, down, texture, glow=glow)
+        add(self.point(x[0], y[1]), width, outward, texture, glow=glow)
+        add(self.point(x[0], y[0], out), width, -outward, texture, glow=glow)
 
-    def storey(self, builder: SurfaceBuilder, y: Span, openings: Iterable[Opening] = ()) -> None:
+    def storey(self, y: Span, openings: Iterable[Opening] = ()) -> None:
         """Add the wall between two heights, with openings that do not overlap.
 
         An opening has reveals, and a window or door at its back. A passage has no back; it has
@@ -227,18 +219,18 @@ class Wall:
         for hole in sorted(openings, key=lambda o: o.x0):
             across, up = (hole.x0, hole.x1), (hole.y0, hole.y1)
             if hole.x0 > x:
-                self.rectangle(builder, (x, hole.x0), y, self.texture)
+                self.rectangle((x, hole.x0), y, self.texture)
             if hole.y0 > y[0]:
-                self.rectangle(builder, across, (y[0], hole.y0), self.texture)
+                self.rectangle(across, (y[0], hole.y0), self.texture)
             if hole.y1 < y[1]:
-                self.rectangle(builder, across, (hole.y1, y[1]), self.texture)
+                self.rectangle(across, (hole.y1, y[1]), self.texture)
             if hole.texture != PASSAGE:
-                self.rectangle(builder, across, up, hole.texture, out=-hole.recess, glow=hole.glow)
+                self.rectangle(across, up, hole.texture, out=-hole.recess, glow=hole.glow)
             if hole.recess:
-                self._frame(builder, across, up, -hole.recess, self.trim)
+                self._frame(across, up, -hole.recess, self.trim)
             x = hole.x1
         if x < self.length:
-            self.rectangle(builder, (x, self.length), y, self.texture)
+            self.rectangle((x, self.length), y, self.texture)
 
 
 @dataclass(frozen=True, eq=False)

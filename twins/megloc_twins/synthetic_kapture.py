@@ -33,13 +33,10 @@ from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, SyntheticWorldOptions, stream
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
-from megloc_twins.viewpoints import CoarseView, coarse_view, query_frames
+from megloc_twins.viewpoints import query_frames
 
 RIG_HEIGHT_M = 1.9
 _RIG_ID = "rig"
-_BONNET_SENSOR = "rig_front"
-
-
 # rig axes: x right, y down, z forward; metres
 SENSOR_FROM_RIG = {
     "rig_front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
@@ -94,7 +91,7 @@ def _mapping_frames(
                     lighting=day_lighting(rng, sun, overcast=0.15),
                     noise_seed=noise_seed(options.seed, image),
                     moving_objects=moving_objects,
-                    bonnet=sensor_id == _BONNET_SENSOR,
+                    bonnet=sensor_id == "rig_front",
                 )
             )
     return frames
@@ -111,24 +108,11 @@ class SyntheticWorld:
     queries: tuple[Frame, ...]  # sorted by name
 
     def frames(self) -> tuple[Frame, ...]:
-        """Return all images, the map's first."""
         return self.mapping + self.queries
 
-    def coarse_views(self) -> dict[str, CoarseView]:
-        """Return a coarse view of every frame by image name, in the world, without moving objects.
 
-        :func:`overlap` of two views tests whether a query and a map image show the same surfaces.
-        """
-        surfaces = [place.surfaces_in_world() for place in self.places]
-        return {
-            frame.name: coarse_view(surfaces[frame.place], frame.camera, frame.cam_from_world)
-            for frame in self.frames()
-        }
-
-
-def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
+def build_world(options: SyntheticWorldOptions) -> SyntheticWorld:
     """Lay out the world and choose all frames, deterministically."""
-    options = options or SyntheticWorldOptions()
     places = tuple(build_place(options, index) for index in range(options.num_places))
     rig_from_world: dict[int, RigidTransform] = {}
     mapping: list[Frame] = []
@@ -211,7 +195,6 @@ def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
 
 
 def depth_name(image: str) -> str:
-    """Return the path of an image's depth map below ``records_data``."""
     return f"depth/{PurePosixPath(image).with_suffix('.depth')}"
 
 

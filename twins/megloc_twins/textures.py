@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from megloc_twins.drawing import (
     TILE,
     Rgb,
-    cv_colour,
     draw_cracks,
     draw_glyphs,
     draw_shapes,
@@ -69,12 +68,7 @@ def paint_wall(
 
 
 def paint_ground(
-    rng: Generator,
-    height: int,
-    width: int,
-    *,
-    material: str,
-    material_seed: float,
+    rng: Generator, height: int, width: int, *, material: str, material_seed: float
 ) -> Rgb:
     """Paint paving or asphalt with patches, lines, manholes and leaves."""
     density = GROUND_TEXELS_PER_M
@@ -107,14 +101,13 @@ def paint_ground(
     for _ in range(int(area_m2 * 2.5)):  # leaves, litter
         x, y = (int(v) for v in rng.uniform((0, 0), (width, height)))
         a, b = (max(1, int(axis)) for axis in rng.uniform(0.02, 0.06, 2) * density)
-        colour = cv_colour(random_colour(rng, 20, 230))
+        colour = random_colour(rng, 20, 230).tolist()
         turn = float(rng.uniform(0, 180))
         cv2.ellipse(image, (x, y), (a, b), turn, 0, 360, colour, -1, cv2.LINE_AA)
     return _worn(rng, image, 0.04, cell=12, octaves=1)
 
 
 def _worn(rng: Generator, image: Rgb, strength: float, *, cell: float, octaves: int) -> Rgb:
-    """Add individual noise to the image."""
     noise = smooth_noise(rng, *image.shape[:2], cell=cell, octaves=octaves)
     return to_rgb(shade(image.astype(np.float32), 1 + strength * noise))
 
@@ -140,7 +133,7 @@ def paint_window(rng: Generator, height: int, width: int) -> Rgb:
     glass = np.array([58, 72, 88], np.float32) * rng.uniform(0.6, 1.3)
     ramp = np.linspace(1.35, 0.7, height, dtype=np.float32)[:, None]
     cloud = 1 + 0.22 * smooth_noise(rng, height, width, cell=50, octaves=4)
-    image = to_rgb(shade(np.broadcast_to(glass, (height, width, 3)), ramp * cloud))
+    image = to_rgb(shade(glass, ramp * cloud))
     if rng.random() < 0.6:  # curtains with folds
         part = int(width * rng.uniform(0.15, 0.35))
         folds = 1 + 0.25 * sin(np.arange(part) * rng.uniform(0.3, 0.7))
@@ -150,10 +143,10 @@ def paint_window(rng: Generator, height: int, width: int) -> Rgb:
     for _ in range(int(rng.integers(1, 4))):  # plants, lamps and vases on the sill
         x, w = int(rng.uniform(0.1, 0.8) * width), int(rng.uniform(0.08, 0.2) * width)
         h = int(rng.uniform(0.1, 0.35) * height)
-        colour = cv_colour(random_colour(rng))
+        colour = random_colour(rng).tolist()
         cv2.ellipse(image, (x, height - h // 2), (w, h), 0, 0, 360, colour, -1)
     bar = max(3, width // 18)
-    colour = cv_colour(frame)
+    colour = frame.tolist()
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), colour, 2 * bar)
     rows, cols = int(rng.integers(1, 4)), int(rng.integers(2, 4))
     for i in range(1, cols):
@@ -172,13 +165,13 @@ def paint_door(rng: Generator, height: int, width: int) -> Rgb:
     tone = _planks(rng, planks, width, seam=0.5)
     grain = smooth_noise(rng, max(2, height // 16), width, cell=6, octaves=2)
     field = tone[None] * (1 + 0.09 * resized(grain, width, height))
-    image = to_rgb(shade(base * np.ones((height, width, 3), np.float32), field))
+    image = to_rgb(shade(base, field))
     for _ in range(int(rng.integers(1, 4))):
         x0, x1 = (int(x) for x in np.sort(rng.uniform(0.08, 0.92, 2)) * width)
         y0, y1 = (int(y) for y in np.sort(rng.uniform(0.05, 0.95, 2)) * height)
-        cv2.rectangle(image, (x0, y0), (x1, y1), cv_colour(base * 0.5), max(2, width // 30))
+        cv2.rectangle(image, (x0, y0), (x1, y1), (base * 0.5).tolist(), max(2, width // 30))
     bar = max(3, width // 16)
-    cv2.rectangle(image, (0, 0), (width - 1, height - 1), cv_colour(base * 0.45), bar)
+    cv2.rectangle(image, (0, 0), (width - 1, height - 1), (base * 0.45).tolist(), bar)
     knob = (int(0.86 * width), int(0.52 * height))
     _disc(image, knob, max(3, width // 22), (214, 190, 110))
     plate = (int(0.3 * width), int(0.14 * height), int(0.7 * width), int(0.24 * height))
@@ -200,18 +193,17 @@ def paint_shutter(rng: Generator, height: int, width: int) -> Rgb:
     base = random_colour(rng, 110, 200, chroma=0.3)
     slats = 1 + 0.18 * sin(np.arange(height) * (2 * np.pi / 11))
     dirt = 1 + 0.09 * smooth_noise(rng, height, width, cell=40, octaves=4)
-    image = to_rgb(shade(np.broadcast_to(base, (height, width, 3)), slats[:, None] * dirt))
+    image = to_rgb(shade(base, slats[:, None] * dirt))
     box = (int(0.08 * width), int(0.3 * height), int(0.95 * width), int(0.85 * height))
     draw_glyphs(rng, image, box, random_colour(rng, 10, 240), rows=int(rng.integers(1, 3)))
     return image
 
 
 def paint_plain(rng: Generator, height: int, width: int) -> Rgb:
-    """Paint a plain surface, for ledges, pipes and reveals."""
     base = np.full(3, rng.uniform(80, 190), np.float32)
     base *= rng.uniform(0.92, 1.08, 3).astype(np.float32)
     field = 1 + 0.09 * smooth_noise(rng, height, width, cell=32, octaves=5)
-    return to_rgb(shade(np.broadcast_to(base, (height, width, 3)), field))
+    return to_rgb(shade(base, field))
 
 
 def paint_glow(rng: Generator, height: int, width: int) -> Rgb:
@@ -247,7 +239,7 @@ def paint_sign(rng: Generator, height: int, width: int) -> Rgb:
     draw_shapes(rng, image[:, :height], 5)
     box = (int(1.1 * height), int(0.08 * height), width, int(0.98 * height))
     draw_glyphs(rng, image, box, ink, rows=1 if rng.random() < 0.6 else 2)
-    cv2.rectangle(image, (0, 0), (width - 1, height - 1), cv_colour(ink), max(2, height // 20))
+    cv2.rectangle(image, (0, 0), (width - 1, height - 1), ink.tolist(), max(2, height // 20))
     return _worn(rng, image, 0.05, cell=40, octaves=5)
 
 
@@ -258,10 +250,10 @@ def paint_wood(rng: Generator, height: int, width: int) -> Rgb:
     tone = _planks(rng, boards, height, seam=0.4)
     grain = smooth_noise(rng, height, max(2, width // 12), cell=8, octaves=3)
     field = tone[:, None] * (1 + 0.12 * resized(grain, width, height))
-    image = to_rgb(shade(np.broadcast_to(base, (height, width, 3)), field))
+    image = to_rgb(shade(base, field))
     for x in (0.04, 0.9):
         end = (int((x + 0.07) * width), height)
-        cv2.rectangle(image, (int(x * width), 0), end, cv_colour(base * 0.75), -1)
+        cv2.rectangle(image, (int(x * width), 0), end, (base * 0.75).tolist(), -1)
         for row in range(boards):
             spot = (int((x + 0.035) * width), int((row + 0.5) * height / boards))
             _disc(image, spot, 2, (50, 46, 42))
@@ -307,7 +299,7 @@ def paint_car(rng: Generator, height: int, width: int, *, side: float = 1.0) -> 
                 cv2.line(image, hub, (int(tip[0]), int(tip[1])), (50, 50, 52), 3, cv2.LINE_AA)
         for share in (0.33, 0.52, 0.7):
             at = int(share * width)
-            cv2.line(image, (at, 0), (at, height), cv_colour(paint * 0.5), 2)
+            cv2.line(image, (at, 0), (at, height), (paint * 0.5).tolist(), 2)
     else:
         for x in (0.1, 0.9):
             lamp = (int(x * width), int(0.3 * height))

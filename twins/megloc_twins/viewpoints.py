@@ -143,8 +143,7 @@ def query_frames(
     condition: Condition,
     total: int,
 ) -> list[Frame]:
-    """Choose the queries of a condition in one place, out of ``total`` in all places; ``mapping``
-    are the map images."""
+    """Choose the queries of a condition in one place, out of ``total`` in all places."""
     map_views = views_of(place, mapping)
     frames = []
     for number in range(place.index, total, options.num_places):
@@ -165,7 +164,7 @@ def query_frames(
                 sensor_id=sensor_id,
                 camera=camera,
                 cam_from_world=cam_from_place @ place.place_from_world,
-                lighting=_query_lighting(options, condition, rng),
+                lighting=_query_lighting(condition, rng),
                 noise_seed=noise_seed(options.seed, image),
                 moving_objects=place_moving_objects(
                     place.plan, rng, options.moving_objects, position, yaw
@@ -190,11 +189,9 @@ def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Ca
     return Camera("SIMPLE_RADIAL", width, height, (focal, cx, cy, rng.uniform(-0.09, 0.04)))
 
 
-def _query_lighting(
-    options: SyntheticWorldOptions, condition: Condition, rng: np.random.Generator
-) -> Lighting:
+def _query_lighting(condition: Condition, rng: np.random.Generator) -> Lighting:
     if condition == "night":
-        return night_lighting(rng, exposure=options.night_exposure)
+        return night_lighting(rng)
     sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(35, 60)))
     return day_lighting(rng, sun, overcast=float(rng.choice([0.1, 0.5, 1.0])))
 

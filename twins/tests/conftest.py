@@ -34,12 +34,8 @@ SMALL: dict[str, SyntheticDataset[Any]] = {
     "synthetic": SyntheticKapture(
         SyntheticWorldOptions(**PLACES, **SIZE, stations_per_place=6, depth=True, masks=True)
     ),
-    "aachen": AachenTwin(
-        AachenTwinOptions(**CITY, **SIZE, stations_per_place=5, points_per_image=60)
-    ),
-    "robotcar": RobotCarTwin(
-        RobotCarTwinOptions(**STREETS, size_px=96, supersampling=1, points_per_image=40)
-    ),
+    "aachen": AachenTwin(AachenTwinOptions(**CITY, **SIZE, stations_per_place=5)),
+    "robotcar": RobotCarTwin(RobotCarTwinOptions(**STREETS, size_px=96, supersampling=1)),
     "4seasons": FourSeasonsTwin(
         FourSeasonsTwinOptions(**DRIVES, width=200, height=100, supersampling=1)
     ),

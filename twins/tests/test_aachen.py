@@ -21,7 +21,6 @@ def test_quirks_of_the_layout(root: Path) -> None:
     # numbered without order, the model's order is its own, and so is that of the intrinsics
     numbers = [int(name[3:-4]) for name in names]
     assert numbers != sorted(numbers) and max(numbers) > len(numbers)
-    assert (models / "aachen_cvpr2018_db.list.txt").read_text().split() == names
     # the NVM's distortion has the other sign
     k = {row[0]: float(row[-1]) for row in listed(models / "database_intrinsics.txt") if row}
     assert set(k) == set(names) and list(k) != names
@@ -37,9 +36,6 @@ def test_quirks_of_the_layout(root: Path) -> None:
     assert numbers == [float(f"{number:.6g}") for number in numbers]
     assert {row[1] for row in day} == {"SIMPLE_RADIAL"}
     assert len({tuple(row[2:]) for row in day + night}) == 8  # a camera each
-    # the list without intrinsics has line ends
-    text = (queries / "day_time_queries_without_intrinsics.txt").read_text()
-    assert text == "".join(f"{row[0]}\n" for row in day)
     images = root / "images_upright"
     on_disk = {str(path.relative_to(images)) for path in (images / "query").rglob("*.jpg")}
     in_lists = {row[0] for row in day + night}

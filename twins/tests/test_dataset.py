@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from kapture.io.features import get_keypoints_fullpath, image_keypoints_from_fil
 from megloc_twins.options import SyntheticDataset
 from scipy.spatial.transform import Rotation
 
+from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder
@@ -133,6 +135,38 @@ def test_points_of_the_reference_model_reproject(
         assert len(error) > 5
     assert 0 < worst < 1e-3
     assert sum(map(len, seen.values())) > 500
+
+
+def test_robotcars_models_share_a_database(rendered: Rendered, tmp_path: Path) -> None:
+    """The merged and the individual models give the same map, with the database's features."""
+    root, models = tmp_path / "root", tmp_path / "root/3D-models"
+    shutil.copytree(rendered("robotcar"), root, symlinks=True)
+    nvm = read_nvm(models / "all-merged/all.nvm")
+    database = pycolmap.Database.open(str(models / "overcast-reference.db"))
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=96, height=96, params=[58.0, 48, 48])
+    camera_id = database.write_camera(camera)
+    for index, name in enumerate(nvm.names):
+        rows = nvm.points.image_ids == index
+        keypoints = np.zeros((int(nvm.points.feature_ids[rows].max()) + 1, 4), np.float32)
+        keypoints[nvm.points.feature_ids[rows], :2] = nvm.points.xy_px[rows]
+        image_id = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+        database.write_keypoints(image_id, keypoints)
+        descriptors = np.full((len(keypoints), 128), index, np.uint8)
+        kind = pycolmap.FeatureExtractorType.SIFT
+        database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, descriptors))
+    database.close()
+    observations = []
+    for model in ("merged", "individual"):
+        dataset = load_plugin(DATASETS, "robotcar", {"model": model, "reference_model": True})
+        write_official(dataset.read(root), tmp_path / model)
+        reference = KaptureFolder(tmp_path / model / "reference")
+        # features and models fit each other, or the import would refuse them
+        reference.validate()
+        assert reference.types("descriptors") == ["sift"]
+        seen = reference.observations()["sift"]
+        observations.append((seen.point_ids, seen.image_ids, seen.keypoint_ids))
+        assert len(seen) > 300
+    np.testing.assert_array_equal(observations[0], observations[1])
 
 
 def assert_same(result: RigidTransform, expected: RigidTransform) -> None:

@@ -11,18 +11,12 @@ from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER
 from megloc_kapture.datasets.fourseasons import read_gnss_poses
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.values import RigidTransform
 
 LAYOUT = "4seasons"
 
 
 def times_of(folder: Path) -> list[int]:
     return [int(line.split()[0]) for line in (folder / "times.txt").read_text().splitlines()]
-
-
-def true_poses(root: Path, part: str) -> dict[str, RigidTransform]:
-    return KaptureFolder(root / "ground_truth" / part).read().poses()
 
 
 def test_the_layouts_quirks(root: Path) -> None:
@@ -41,24 +35,9 @@ def test_the_layouts_quirks(root: Path) -> None:
         assert (header.count(","), row.count(",")) == (10, 9)
         blank = "\n\n" in (folder / "Transformations.txt").read_text()
         assert blank == (name == REFERENCE)
-        assert (folder / "septentrio.nmea").read_text().startswith(",D*1C\n$GPRMC,")
     image = read_image_rgb(next((root / REFERENCE / "undistorted_images/cam0").iterdir()))
     assert image.shape == (100, 200, 3)
     assert (image == image[..., :1]).all()  # grey
-
-
-def test_fixes_of_the_receiver_are_where_the_car_is(root: Path) -> None:
-    import kapture
-    from kapture.converter.nmea.import_nmea import extract_gnss_from_nmea
-
-    truth = true_poses(root, "mapping")
-    centers = [truth[name].center() for name in sorted(truth) if "/cam0/" in name]
-    _, records = extract_gnss_from_nmea(str(root / REFERENCE / "septentrio.nmea"), "GNSS")
-    fixes = [fix for _, _, fix in kapture.flatten(records, is_sorted=True)]
-    assert len(fixes) == len(centers)
-    for fix, center in zip(fixes, centers, strict=True):
-        there = earth_from_enu(fix.y, fix.x, fix.z).translation
-        assert np.linalg.norm(np.array(there) - center) < 1e-2
 
 
 @pytest.mark.parametrize("place", [(-33.9, 151.2, 12.0), (0.0, -180.0, -30.0)])

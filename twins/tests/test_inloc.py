@@ -18,12 +18,7 @@ from megloc_twins.indoor_rooms import (
     build_module,
     build_room,
 )
-from megloc_twins.inloc import (
-    cam_from_scan,
-    cutout_camera,
-    phone_camera,
-    scanned_points,
-)
+from megloc_twins.inloc import cam_from_scan, cutout_camera, phone_camera, scanned_points
 from megloc_twins.rasterization import depth_map, sample_grid, visible_surfaces
 from megloc_twins.surfaces import Surfaces
 

@@ -10,7 +10,7 @@ import kapture.io.csv
 import numpy as np
 import pytest
 from kapture.io.records import TransferAction
-from megloc_twins.model_files import write_nvm
+from megloc_twins.sparse_models import write_nvm
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets import nvm as nvm_reader
