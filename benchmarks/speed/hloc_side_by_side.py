@@ -65,6 +65,7 @@ TYPE, FLOAT = "features", np.dtype("float32")
 ALIKED = {"max_keypoints": 2048, "threshold": 0.05, "device": "cpu"}
 SIFT = {"sparse": {"first_octave": 0, "peak_threshold": 0.01}, "dense": {}}
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+KEEP_ALL = LocalizationOptions(min_confidence=0.0)  # as hloc; a rejected pose counts as a miss
 STEPS = ("match map", "triangulation", "match queries", "localization")
 HERE = Path(__file__).resolve().parent
 Poses = dict[str, RigidTransform]
@@ -101,7 +102,7 @@ def ours(job: dict[str, Any]) -> dict[str, Any]:
 
     def localize() -> dict[str, Any]:
         results = localize_from_matches(
-            KaptureFolder(output), query, query_matches, query_pairs, [TYPE], LocalizationOptions()
+            KaptureFolder(output), query, query_matches, query_pairs, [TYPE], KEEP_ALL
         )
         return {
             pose.name: pose.cam_from_world.matrix()[:3].tolist()
