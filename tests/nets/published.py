@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import runpy
 import zlib
 from pathlib import Path
 from typing import TypeVar
@@ -16,6 +17,8 @@ Net = TypeVar("Net", bound=nn.Module)
 Tensors = dict[str, torch.Tensor]
 Shapes = dict[str, tuple[int, ...]]
 FOLDER = Path(__file__).parent
+# random weights by key and shape, which are the same under every version of numpy and torch
+random_state = runpy.run_path(str(FOLDER / "data/deeplabv3plus/make_reference.py"))["random_state"]
 
 
 def published_shapes(name: str) -> Shapes:

@@ -114,23 +114,6 @@ def test_cameras_are_scaled_with_their_images(camera: Camera, size: tuple[int, i
     assert scaled.model == (camera if twice else with_two_focals(camera)).model
 
 
-def centroid(image: NDArray[np.uint8]) -> NDArray[np.float64]:
-    grey = image[..., 0].astype(float)
-    y, x = np.indices(grey.shape) + 0.5
-    return np.array([[(grey * x).sum(), (grey * y).sum()]]) / grey.sum()
-
-
-@pytest.mark.parametrize("max_size_px", [121, 900])
-def test_a_blob_keeps_its_place(max_size_px: int) -> None:
-    x0, y0 = 201.3, 120.8
-    image = painted(lambda x, y: 250 * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * 8.0**2)))
-    camera = Camera("PINHOLE", 483, 362, (330.0, 330.0, 243.0, 181.0))
-    plan = plan_frame(camera, FrameOptions(max_size_px=max_size_px, upscale=True))
-    result = centroid(processed_image(image, plan))
-    back = carry_points(plan.processed, plan.original, result)
-    np.testing.assert_allclose(back, [[x0, y0]], atol=0.03)
-
-
 def test_cropping_keeps_pixels_and_shrinking_averages_them() -> None:
     image = painted(lambda x, y: x + y / 2, 123, 61)
     camera = Camera("SIMPLE_RADIAL", 123, 61, (100.0, 60.0, 30.0, 0.1))
@@ -220,16 +203,6 @@ def test_undistorted_images_equal_colmap(model: str, monkeypatch: pytest.MonkeyP
     assert inner.mean() > 0.5
     assert difference.max() <= 6
     assert difference.mean() < 0.6
-
-
-@pytest.mark.parametrize("options", [SMALL, FrameOptions(max_size_px=200)])
-def test_keypoints_are_carried_back_exactly(camera: Camera, options: FrameOptions) -> None:
-    plan = plan_frame(camera, options)
-    size = [plan.processed.width, plan.processed.height]
-    points = np.random.default_rng(5).random((100, 2)) * size
-    original = carry_points(plan.processed, plan.original, points)
-    back = carry_points(plan.original, plan.processed, original)
-    np.testing.assert_allclose(back, points, rtol=0, atol=1e-6)
 
 
 def test_pixels_outside_the_other_image_are_nan() -> None:
