@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,60 +17,16 @@ from megloc_kapture.features.aslfeat import (
     AslFeatMaps,
     AslFeatOptions,
     aslfeat_from,
-    on_no_edge,
     peakiness,
 )
-from megloc_kapture.values import LocalFeatures
 
 # written by make_reference.py in the same folder
 TENSORFLOW = Path(__file__).parent.parent / "nets" / "data" / "aslfeat"
-OnMaps = Callable[..., LocalFeatures]
 
 
 def extractor(weights: Path, **options: object) -> AslFeat:
     given = {"weights": str(weights), "device": "cpu", **options}
     return AslFeat(AslFeatOptions.model_validate(given))
-
-
-@pytest.fixture
-def on_maps(monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path) -> OnMaps:
-    """Return a function that extracts keypoints of given maps."""
-
-    def extracted(scores: torch.Tensor, features: torch.Tensor | None = None) -> LocalFeatures:
-        height, width = scores.shape
-        if features is None:
-            features = torch.ones(128, -(-height // 4), -(-width // 4))
-        given = (lambda _: [AslFeatMaps(scores, features)]), torch.device("cpu")
-        monkeypatch.setattr(aslfeat.AslFeat, "network", lambda *_: given)
-        image = np.zeros((height, width, 3), np.uint8)
-        image[0] = 255  # images without contrast are skipped
-        return extractor(aslfeat_weights).extract(image)
-
-    return extracted
-
-
-def blobs(centres: list[tuple[float, float]], heights: list[float]) -> torch.Tensor:
-    """Score map of 60 x 80 with round peaks of 2 px around (x, y), integers at pixel centres."""
-    rows, columns = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
-    scores = torch.full((60, 80), 0.1)
-    for (x, y), height in zip(centres, heights, strict=True):
-        scores += (height - 0.1) * torch.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 8)
-    return scores
-
-
-def test_keypoints_are_the_centres_of_blobs(on_maps: OnMaps) -> None:
-    centres = [(20.0, 30.0), (50.3, 20.0), (60.25, 45.6)]
-    result = on_maps(blobs(centres, [2.0, 1.5, 1.0]))
-    # a blob at a pixel's centre lies at half a pixel in COLMAP's coordinates
-    np.testing.assert_allclose(result.keypoints_px[:, :2], np.array(centres) + 0.5, atol=0.05)
-    np.testing.assert_allclose(result.keypoints_px[0, :2], [20.5, 30.5], atol=1e-4)
-    np.testing.assert_allclose(result.scores[0], 2.0, atol=1e-3)
-
-
-def test_weak_peaks_and_peaks_at_the_border_are_no_keypoints(on_maps: OnMaps) -> None:
-    centres = [(4.0, 30.0), (5.0, 45.0), (75.0, 20.0), (74.0, 40.0), (40.0, 30.0)]
-    result = on_maps(blobs(centres, [2.0, 1.5, 2.0, 1.2, 0.4]))
-    np.testing.assert_allclose(result.keypoints_px[:, :2], [[5.5, 45.5], [74.5, 40.5]], atol=0.01)
 
 
 @pytest.mark.parametrize("image", ["even", "odd"])
@@ -140,21 +95,3 @@ def test_strips_give_the_same_peakiness(monkeypatch: pytest.MonkeyPatch) -> None
     whole = peakiness(features, 3, torch.tensor(1.0))
     monkeypatch.setitem(aslfeat._VALUES_AT_ONCE, "cpu", 3 * 11 * 6)
     torch.testing.assert_close(peakiness(features, 3, torch.tensor(1.0)), whole, rtol=0, atol=1e-6)
-
-
-ROWS, COLUMNS = torch.meshgrid(*[torch.arange(41.0, dtype=torch.float64) - 20] * 2, indexing="ij")
-CENTRE = torch.tensor([[20, 20]])
-
-
-@pytest.mark.parametrize(
-    ("length_px", "max_ratio", "kept"),
-    [(4.0, 10.0, True), (9.0, 10.0, True), (30.0, 10.0, False), (9.0, 2.0, False)],
-)
-def test_long_blobs_are_edges(length_px: float, max_ratio: float, kept: bool) -> None:
-    blob = torch.exp(-((COLUMNS / 4) ** 2 + (ROWS / length_px) ** 2) / 2)
-    assert on_no_edge(blob, CENTRE, max_ratio).tolist() == [kept]
-
-
-def test_saddles_and_flat_regions_are_rejected() -> None:
-    for scores in (COLUMNS**2 - ROWS**2, torch.ones(41, 41)):
-        assert not on_no_edge(scores, CENTRE, 10.0).any()
