@@ -10,6 +10,7 @@ import pytest
 from camera_models import CAMERAS
 from numpy.typing import NDArray
 from poses import displaced, error_vector, random_pose
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
@@ -45,14 +46,6 @@ def texture(rng: np.random.Generator, channels: int, deviation_px: float = 1.5) 
     return np.asarray(smooth / smooth.std())
 
 
-def bilinear(values: Array, x: Array, y: Array) -> Array:
-    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
-    a, b = (x - column)[:, None], (y - row)[:, None]
-    top = (1 - a) * values[row, column] + a * values[row, column + 1]
-    low = (1 - a) * values[row + 1, column] + a * values[row + 1, column + 1]
-    return np.asarray((1 - b) * top + b * low)
-
-
 def problem(
     model: str = "PINHOLE",
     *,
@@ -70,7 +63,9 @@ def problem(
     points = pose.inverse().apply(bearing_rays(camera, px) * rng.uniform(2.0, 9.0, (count, 1)))
     scale = WIDTH / camera.width
     # float32 like the level
-    values = bilinear(image.astype(np.float32).astype(float), *(scale * px.T - 0.5))
+    at = (scale * px.T - 0.5)[::-1]
+    levels = np.moveaxis(image.astype(np.float32).astype(float), 2, 0)
+    values = np.stack([map_coordinates(level, at, order=1) for level in levels], axis=1)
     groups = rng.integers(0, 2, count)
     values = np.array([0.7, 1.3])[groups, None] * values + np.array([0.2, -0.4])[groups, None]
     outliers = rng.random(count) < wrong
