@@ -178,20 +178,6 @@ def test_relative_poses_are_query_from_reference() -> None:
     np.testing.assert_allclose(scaled.translation, 2.5 * np.array(result.translation))
 
 
-def test_lists_of_pairs(tmp_path: Path) -> None:
-    path = tmp_path / "pairs.txt"
-    path.write_bytes(b"1600000000000000000 1600000000000000001\r\n\r\n3\t4")
-    assert read_mlad_file(path) == [
-        RelativePose(1600000000000000000, 1600000000000000001),
-        RelativePose(3, 4),
-    ]
-    # and true poses of training files
-    path.write_text(GOOD_PAIR + "100 206 0 0 0 0 0 0 1\n")
-    first, second = read_mlad_file(path)
-    assert first.query_from_reference == RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
-    assert second == RelativePose(100, 206, HERE)
-
-
 def test_provenance_has_options_and_the_hash_of_the_file(tmp_path: Path) -> None:
     pose_file = tmp_path / "aachen.txt"
     pose_file.write_text("a.jpg 1 0 0 0 0 0 0\n")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scored import evaluate_poses, write_kapture
+from scored import evaluate_poses, pose_at, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate_results
@@ -113,12 +113,6 @@ def test_results_without_scored_queries_are_refused() -> None:
 THRESHOLDS = thresholds_from_pairs(((0.1, None), (0.2, None), (0.5, None)))
 FILE = "relocalizationFile_recording_a_to_recording_b.txt"
 Poses = dict[str, RigidTransform]
-
-
-def pose_at(center: list[float], turn_deg: float = 0.0) -> RigidTransform:
-    """A camera at ``center``, turned about its vertical axis."""
-    rotation = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
-    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
 
 
 def pairs_of(queries: list[str], reference: str = "ref/0.png") -> list[RelocalizationPair]:

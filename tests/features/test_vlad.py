@@ -19,6 +19,7 @@ from megloc_kapture.features.vlad import (
     aggregate,
     learn_whitening,
     sample_rows,
+    soft_assignment,
     train_vlad,
     train_vocabulary,
 )
@@ -58,6 +59,11 @@ def test_the_vector_equals_the_formula(assignment: str, monkeypatch: pytest.Monk
         assert vector.dtype == np.float32 and vector.shape == (40,)
         expected = by_formula(descriptors.astype(np.float32), words, assignment)
         np.testing.assert_allclose(vector, expected, atol=2e-6)
+
+
+def test_soft_weights_do_not_overflow_far_from_every_centre() -> None:
+    far = soft_assignment(np.array([[1e4, 0.0]]), np.array([[1.0, 0.0], [0.0, 1.0]]), 1000.0)
+    np.testing.assert_array_equal(far, [[1.0, 0.0]])
 
 
 @pytest.mark.parametrize("assignment", ["hard", "soft"])
@@ -132,6 +138,20 @@ def test_each_image_gives_its_share_of_sampled_rows(
         assert (np.diff(chosen) > 0).all()  # sorted, each once
         assert len(chosen) == 0 or (chosen.min() >= 0 and chosen.max() < count)
         assert count * share <= len(chosen) + 1e-9 and len(chosen) < count * share + 1 + 1e-9
+
+
+def test_vocabularies_are_concatenated_with_equal_weight() -> None:
+    rng = np.random.default_rng(11)
+    data = unit_rows(rng, 300, 8)
+    options = VladOptions(num_clusters=4, vocabularies=3)
+    vocabulary = train_vocabulary(data, options)
+    assert vocabulary.centres.shape == (3, 4, 8) and vocabulary.size == 96
+    assert len({centres.tobytes() for centres in vocabulary.centres}) == 3
+    image = unit_rows(rng, 40, 8)
+    alone = [by_formula(image, centres, options.assignment) for centres in vocabulary.centres]
+    np.testing.assert_allclose(
+        aggregate(image, vocabulary, options), np.concatenate(alone) / np.sqrt(3), atol=2e-6
+    )
 
 
 def images_of(rng: np.random.Generator, count: int) -> dict[str, NDArray[np.float32]]:
