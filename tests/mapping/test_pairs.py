@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays
@@ -109,35 +107,6 @@ def test_an_angle_of_180_degrees_is_no_bound() -> None:
     assert min(cosines) < -1.0
 
 
-def test_cameras_at_the_same_position_have_enough_pairs() -> None:
-    cameras = 120 * [camera_at(np.zeros(3), Rotation.identity())]
-    result = pairs_by_poses(cameras, PairsByPosesOptions(num_neighbours=3))
-    assert (result[:, 0] < result[:, 1]).all() and len(result) <= 120 * 3
-    assert np.bincount(result.ravel(), minlength=120).min() >= 3
-
-
-def test_the_search_of_neighbours_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All viewing directions differ: a search of all images would take quadratic time."""
-    axes = Rotation.from_rotvec(np.linspace([0, 0, 0], [0, np.pi, 0], 400))
-    cameras = [camera_at(np.array([float(k), 0, 0]), axes[k]) for k in range(400)]
-    searched = []
-
-    class Tree(cKDTree):
-        def query(self, x: Any, k: int, **more: Any) -> Any:
-            searched.append(len(x) * k)
-            return super().query(x, k, **more)
-
-    monkeypatch.setattr(module, "cKDTree", Tree)
-    monkeypatch.setattr(module, "_MAX_SEARCHED", 50)
-    options = PairsByPosesOptions(num_neighbours=5, max_angle_deg=0.4)
-    assert len(pairs_by_poses(cameras, options)) == 0
-    assert sum(searched) <= 400 * 3 * 51
-    # two images have the direction of their 50th and 51st neighbour
-    cameras[50] = camera_at(np.array([50.0, 0, 0]), axes[0])
-    cameras[399 - 51] = camera_at(np.array([399.0 - 51, 0, 0]), axes[399])
-    assert pairs_by_poses(cameras, options).tolist() == [[0, 50]]
-
-
 def by_sets(
     num_images: int, observations: Sequence[tuple[int, int]], top_k: int, min_shared: int
 ) -> list[list[int]]:
@@ -179,18 +148,6 @@ def test_pairs_by_covisibility_equal_the_sets(
         result = pairs_by_covisibility(num_images, arrays[:, 0], arrays[:, 1], options)
     assert result.dtype == np.int64 and result.shape[1] == 2
     assert result.tolist() == by_sets(num_images, observations, top_k, min_shared_points)
-
-
-def test_points_in_all_images_give_few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All pairs of 2,000 images would be 2 million for each point."""
-    monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 2)
-    options = PairsByCovisibilityOptions(top_k=3)
-    images = np.tile(np.arange(2_000), 2)
-    result = pairs_by_covisibility(2_000, np.repeat([0, 1], 2_000), images, options)
-    # all share as many points: the first in the window are taken
-    assert (np.bincount(result.ravel(), minlength=2_000) >= 3).all()
-    assert len(result) <= 2_000 * 3
-    assert np.diff(result, axis=1).max() == module._TRACK_WINDOW
 
 
 def test_images_of_a_long_track_pair_with_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
