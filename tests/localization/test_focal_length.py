@@ -25,7 +25,6 @@ from megloc_kapture.localization.focal_length import (
     focal_misfit,
     misfits_text,
     refine_with_intrinsics,
-    shared_camera,
     solve_with_shared_camera,
 )
 from megloc_kapture.localization.map_index import PoseProblem, View
@@ -212,12 +211,3 @@ def test_another_zoom_keeps_its_focal_length() -> None:
     assert solved[0].camera != poses[0].camera
     for few in ([], poses[:1]):
         assert solve_with_shared_camera(few, OPTIONS) == few
-
-
-def test_the_shared_camera_is_that_of_the_certain_estimates() -> None:
-    cameras = [
-        replace(TRUE, params=(f, 768.0, 512.0, 0.0), focal_deviation=d)
-        for f, d in ((1200.0, 0.1), (1380.0, 0.004), (1381.0, 0.004), (1600.0, 0.1))
-    ]
-    assert shared_camera(cameras).params[0] in (1380.0, 1381.0)
-    assert shared_camera(cameras) == shared_camera(cameras[::-1])

@@ -210,17 +210,6 @@ def test_inliers_are_counted_in_pixels() -> None:
     assert pose.num_inliers == 75
 
 
-def test_unusable_matches_are_ignored() -> None:
-    rng = np.random.default_rng(7)
-    truth = random_pose(rng)
-    view = noisy_view(PINHOLE, truth, rng, 60)
-    some = replace(view, points_px=view.points_px[20:], points_world=view.points_world[20:])
-    first = located(refined(view, truth, usable=np.arange(60) >= 20))
-    second = located(refined(some, truth))
-    assert np.abs(error_vector(first.cam_from_world, second.cam_from_world)).max() < 1e-9
-    assert first.inliers is not None and not first.inliers[:20].any()
-
-
 def test_an_unstable_pose_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     """All points lie within millimetres of a line: the camera can nearly rotate about it."""
     rng = np.random.default_rng(8)

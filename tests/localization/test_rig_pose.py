@@ -215,11 +215,3 @@ def test_views_are_stacked_and_split() -> None:
     assert len(PoseProblem.of([unknown]).covariances) == 0
     parts = stacked.split(np.array([True, False, True]))
     assert [part.tolist() for part in parts] == [[True], [], [False, True]]
-
-
-def test_invalid_points_do_not_move_the_origin() -> None:
-    points = np.full((200, 3), 5e6)
-    points[::2] = np.nan
-    points[3] = 1e300
-    view = View(PINHOLE, AT_ORIGIN, np.zeros((200, 2)), points)
-    assert np.abs(PoseProblem.of([view]).offset).max() <= 5e6

@@ -225,10 +225,3 @@ def test_positions_are_interpolated_with_the_offset_of_dinov2(rows: int, columns
     result = net.positions(rows, columns).detach()
     torch.testing.assert_close(result[0, 0], learnt[0, 0])
     torch.testing.assert_close(result[0, 1:].T, expected[0].flatten(1), rtol=0, atol=1e-5)
-
-
-def test_incomplete_patches_are_ignored() -> None:
-    net = small_trunk()
-    image = torch.randn(1, 3, 75, 95, generator=torch.Generator().manual_seed(5))
-    torch.testing.assert_close(tokens_of(net, image), tokens_of(net, image[:, :, :70, :84]))
-    assert tokens_of(net, image).shape == (1, 1 + 5 * 6, DINO_CHANNELS)
