@@ -17,6 +17,7 @@ from megloc_kapture.features.aslfeat import (
     AslFeatMaps,
     AslFeatOptions,
     aslfeat_from,
+    on_no_edge,
     peakiness,
 )
 
@@ -95,3 +96,21 @@ def test_strips_give_the_same_peakiness(monkeypatch: pytest.MonkeyPatch) -> None
     whole = peakiness(features, 3, torch.tensor(1.0))
     monkeypatch.setitem(aslfeat._VALUES_AT_ONCE, "cpu", 3 * 11 * 6)
     torch.testing.assert_close(peakiness(features, 3, torch.tensor(1.0)), whole, rtol=0, atol=1e-6)
+
+
+ROWS, COLUMNS = torch.meshgrid(*[torch.arange(41.0, dtype=torch.float64) - 20] * 2, indexing="ij")
+CENTRE = torch.tensor([[20, 20]])
+
+
+@pytest.mark.parametrize(
+    ("length_px", "max_ratio", "kept"),
+    [(4.0, 10.0, True), (9.0, 10.0, True), (30.0, 10.0, False), (9.0, 2.0, False)],
+)
+def test_long_blobs_are_edges(length_px: float, max_ratio: float, kept: bool) -> None:
+    blob = torch.exp(-((COLUMNS / 4) ** 2 + (ROWS / length_px) ** 2) / 2)
+    assert on_no_edge(blob, CENTRE, max_ratio).tolist() == [kept]
+
+
+def test_saddles_and_flat_regions_are_rejected() -> None:
+    for scores in (COLUMNS**2 - ROWS**2, torch.ones(41, 41)):
+        assert not on_no_edge(scores, CENTRE, 10.0).any()

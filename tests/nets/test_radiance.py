@@ -11,6 +11,7 @@ import torch
 from megloc_kapture.nets.radiance import (
     NerfW,
     Rays,
+    Rendered,
     Samples,
     TriPlane,
     _contracted,
@@ -60,6 +61,14 @@ def test_a_transient_slab_shares_the_light_by_density() -> None:
     assert result.beta.item() == pytest.approx(0.03 + 0.4 * 0.75 * opacity, rel=1e-3)
     assert result.opacity.item() == pytest.approx(opacity, abs=1e-12)
     assert result.transient_density.item() == pytest.approx(1.5)
+
+
+def test_the_loss_of_a_ray_by_hand() -> None:
+    one = torch.ones(1)
+    rendered = Rendered(torch.zeros(1, 3), one, one, 0.5 * one, one[None], torch.tensor(2.0))
+    # squared error over twice the variance, logarithm of the deviation plus 3, and 0.01 * density
+    expected = torch.tensor(1 / (2 * 0.5**2) + math.log(0.5) + 3 + 0.01 * 2)
+    torch.testing.assert_close(nerf_w_loss(rendered, torch.ones(1, 3)), expected)
 
 
 def test_samples_lie_where_they_should() -> None:
