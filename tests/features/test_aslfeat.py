@@ -21,7 +21,7 @@ from megloc_kapture.features.aslfeat import (
     peakiness,
 )
 
-# written by make_reference.py in the same folder
+# written by TensorFlow, see tests/nets/data/README.md
 TENSORFLOW = Path(__file__).parent.parent / "nets" / "data" / "aslfeat"
 
 

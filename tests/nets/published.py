@@ -37,7 +37,7 @@ def _read(path: Path) -> Shapes:
 
 
 def delg_variables(kind: str) -> dict[str, NDArray[np.float32]]:
-    """Return the random variables of data/delg/make_reference.py."""
+    """Return the random variables for which data/delg/reference.npz was written."""
     drawn = {}
     words = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_variance")
     for name, shape in delg_shapes(kind).items():
