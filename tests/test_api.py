@@ -16,10 +16,7 @@ import megloc_kapture as megloc
 from megloc_kapture.io.images import read_image_rgb, read_photo
 from megloc_kapture.io.kapture import KaptureFolder
 
-SMALL = {
-    "local_features.options.max_keypoints": 800,
-    "global_features.options.num_clusters": 8,
-}
+SMALL = {"local_features.options.max_keypoints": 800, "global_features.options.num_clusters": 8}
 
 
 @pytest.fixture(scope="module")

@@ -94,10 +94,7 @@ def make_world(num_queries: int = 40, seed: int = 0) -> World:
 
 
 def write_kapture(
-    root: Path,
-    images: Sequence[str],
-    poses: Mapping[str, RigidTransform],
-    camera: Camera = CAMERA,
+    root: Path, images: Sequence[str], poses: Mapping[str, RigidTransform], camera: Camera = CAMERA
 ) -> Path:
     """A kapture folder of one camera: all ``images`` recorded, ``poses`` as trajectories."""
     write_sensors(root, one_camera(sorted(images), poses, camera=camera))

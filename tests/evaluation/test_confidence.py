@@ -34,10 +34,7 @@ def test_risk_by_hand() -> None:
 
 def status(image: str, confidence: float | None, localized: bool = True) -> LocalizationResult:
     return LocalizationResult(
-        name=image,
-        reason="" if localized else "too little",
-        num_inliers=10,
-        confidence=confidence,
+        name=image, reason="" if localized else "too little", num_inliers=10, confidence=confidence
     )
 
 

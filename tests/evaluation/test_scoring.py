@@ -228,10 +228,7 @@ def test_pose_files_and_folders_have_equal_figures(
     assert folder.thresholds == THRESHOLDS
     # one file of two: the other file's pairs have no pose
     (half,) = evaluate_results(
-        [files / "reloc_b.txt"],
-        workspace / "query_gt",
-        rules,
-        mapping=workspace / "mapping",
+        [files / "reloc_b.txt"], workspace / "query_gt", rules, mapping=workspace / "mapping"
     )
     assert half.row("b").num_missing == 0
     assert half.row("c").num_missing == 3

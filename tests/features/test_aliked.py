@@ -11,12 +11,7 @@ from images import Image
 from kornia.feature import ALIKED
 from published import Tensors, random_tensors
 
-from megloc_kapture.features.aliked import (
-    _VALUES_AT_ONCE,
-    Aliked,
-    AlikedOptions,
-    aliked_from,
-)
+from megloc_kapture.features.aliked import _VALUES_AT_ONCE, Aliked, AlikedOptions, aliked_from
 
 
 @pytest.fixture

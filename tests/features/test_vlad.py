@@ -91,11 +91,7 @@ def test_the_vocabulary_finds_well_separated_clusters() -> None:
             (np.repeat(np.eye(3, 8), 20, axis=0), VladOptions(num_clusters=10)),
             "fewer than 10 distinct",
         ),
-        (
-            train_vocabulary,
-            (np.full((20, 8), np.nan), VladOptions(num_clusters=4)),
-            "not finite",
-        ),
+        (train_vocabulary, (np.full((20, 8), np.nan), VladOptions(num_clusters=4)), "not finite"),
         (aggregate, (np.zeros((5, 4)), Vocabulary(np.eye(3, 8)[None])), "4 dimensions, .* has 8"),
         (train_vlad, (["a"], lambda _: 0, lambda _: EMPTY, VladOptions()), "no descriptors"),
         (learn_whitening, (np.ones((4, 8), np.float32), 3), "from 4 images with equal"),

@@ -74,9 +74,7 @@ def matches(shares: Mapping[str, Sequence[int]]) -> list[ImageMatches]:
 
 
 def view(
-    shares: Mapping[str, int | Sequence[int]],
-    cam_from_rig: RigidTransform = ALONE,
-    name: str = "q",
+    shares: Mapping[str, int | Sequence[int]], cam_from_rig: RigidTransform = ALONE, name: str = "q"
 ) -> QueryView:
     """Return a view of the right place; ``shares`` has rows or counts of matches by image."""
     rows = {n: range(share) if isinstance(share, int) else share for n, share in shares.items()}
@@ -218,8 +216,7 @@ def partition(labels: NDArray[np.int64]) -> set[frozenset[int]]:
 
 
 @given(
-    st.lists(st.tuples(*[st.integers(-20, 20)] * 3), max_size=30, unique=True),
-    st.integers(1, 12),
+    st.lists(st.tuples(*[st.integers(-20, 20)] * 3), max_size=30, unique=True), st.integers(1, 12)
 )
 def test_centres_are_clustered_by_single_linkage(
     centers: list[tuple[int, int, int]], radius: int

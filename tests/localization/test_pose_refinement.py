@@ -116,11 +116,7 @@ def test_without_covariances_the_pose_equals_poselibs(sigma_px: float) -> None:
 
 
 @pytest.mark.usefixtures("whole_covariance")
-@given(
-    st.sampled_from(sorted(CAMERAS)),
-    st.integers(0, 2**32 - 1),
-    st.sampled_from([1e-3, 1, 1e3]),
-)
+@given(st.sampled_from(sorted(CAMERAS)), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1, 1e3]))
 def test_refinement_converges_under_any_model(model: str, seed: int, unit: float) -> None:
     rng = np.random.default_rng(seed)
     truth = random_pose(rng)

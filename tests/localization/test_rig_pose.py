@@ -60,8 +60,7 @@ def exact(result: Pose | Failure, truth: RigidTransform, within: float = 1e-7) -
 
 
 @pytest.mark.parametrize(
-    ("count", "seed", "shift", "within"),
-    [(30, 0, 0, 1e-7), (30, 0, 4.5e6, 1e-5), (8, 1, 0, 1e-7)],
+    ("count", "seed", "shift", "within"), [(30, 0, 0, 1e-7), (30, 0, 4.5e6, 1e-5), (8, 1, 0, 1e-7)]
 )
 def test_exact_matches_give_the_exact_pose(
     count: int, seed: int, shift: float, within: float

@@ -75,10 +75,7 @@ def ceres(scene: pycolmap.Reconstruction, ids: list[int]) -> Floats:
     return np.array([result.get_point_cov(point_id) for point_id in ids])
 
 
-@pytest.mark.parametrize(
-    ("model", "narrow"),
-    [("OPENCV", True), ("OPENCV_FISHEYE", False)],
-)
+@pytest.mark.parametrize(("model", "narrow"), [("OPENCV", True), ("OPENCV_FISHEYE", False)])
 def test_covariances_equal_ceres(model: str, narrow: bool) -> None:
     scene = synthetic(model, narrow=narrow)
     images = sorted(scene.images)

@@ -18,11 +18,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.acceptance import RenderingOptions
 from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
-from megloc_kapture.refinement.rendering import (
-    Rendering,
-    _Refining,
-    refine_by_rendering,
-)
+from megloc_kapture.refinement.rendering import Rendering, _Refining, refine_by_rendering
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()

@@ -20,10 +20,7 @@ from megloc_kapture.io.kapture.features import (
     feature_folder,
     list_types,
 )
-from megloc_kapture.io.kapture.matches import (
-    MatchesReader,
-    MatchesWriter,
-)
+from megloc_kapture.io.kapture.matches import MatchesReader, MatchesWriter
 
 KEYPOINTS = FeatureConfig("name inside", np.dtype("float32"), 3)
 DESCRIPTORS = FeatureConfig("d", np.dtype("uint8"), 4, "k", "L2")
