@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import random_pose
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.evaluation.pose_files import (
@@ -164,12 +164,7 @@ def test_names_by_path_end_and_other_suffix() -> None:
 
 def test_relative_poses_are_query_from_reference() -> None:
     rng = np.random.default_rng(0)
-    turns = Rotation.random(2, random_state=0)
-    centers = rng.normal(size=(2, 3)) * 1e3
-    query, reference = (
-        RigidTransform.from_matrix(turn.as_matrix(), -turn.apply(center))
-        for turn, center in zip(turns, centers, strict=True)
-    )
+    query, reference = random_pose(rng), random_pose(rng)
     result = relative_pose(query, reference)
     point = rng.normal(size=(1, 3)) * 1e3
     np.testing.assert_allclose(result.apply(reference.apply(point)), query.apply(point), atol=1e-9)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from poses import random_pose
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import median_abs_deviation
@@ -91,9 +92,7 @@ def test_arrays_agree_with_the_value_type(seed: int) -> None:
 
 @given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
 def test_a_perturbation_is_the_exponential_of_its_rotation(step: list[float]) -> None:
-    pose = RigidTransform.from_matrix(
-        Rotation.random(rng=1).as_matrix(), np.array([5.0, -3.0, 2.0])
-    )
+    pose = random_pose(np.random.default_rng(1))
     rotation = expm(cross_matrix(np.array(step[:3])))
     moved = perturbed(pose, np.array(step))
     expected = rotation @ pose.translation + step[3:]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from camera_models import CAMERAS, PINHOLE
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from poses import rigid
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.io.colmap import (
@@ -42,8 +42,8 @@ def scene(
     images, row_of_point = [], []
     for k in range(num_images):
         camera = cameras[k % len(cameras)]
-        rotation = Rotation.from_rotvec([0.05 * k, 0.12 * (k - num_images / 2), 0.1]).as_matrix()
-        near = RigidTransform.from_matrix(rotation, np.array([0.6 * (k - 2), 0.1 * k, 8.0]))
+        rotation = [0.05 * k, 0.12 * (k - num_images / 2), 0.1]
+        near = rigid(rotation, [0.6 * (k - 2), 0.1 * k, 8.0])
         pixels = px_from_cam(camera, near.apply(points))
         assert (pixels > 0).all() and (pixels < (camera.width, camera.height)).all()
         order = rng.permutation(num_points)

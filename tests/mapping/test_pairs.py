@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from poses import rigid
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays
@@ -223,9 +224,8 @@ def test_views_with_a_common_point_can_overlap(seed: int) -> None:
 @pytest.mark.parametrize("apart_m", [0.0, 40.0])
 def test_opposite_views_do_not_overlap(camera: Camera, apart_m: float) -> None:
     here = RigidTransform.identity()
-    turn = Rotation.from_euler("y", 180, degrees=True).as_matrix()
     # the other camera is behind, and looks away
-    there = RigidTransform.from_matrix(turn, -turn @ [0.0, 0.0, -apart_m])
+    there = rigid([0.0, np.pi, 0.0], [0.0, 0.0, -apart_m])
     assert not views_can_overlap(camera, here, camera, there)
     assert not views_can_overlap(camera, there, camera, here)
 
@@ -234,6 +234,5 @@ def test_views_rotated_by_more_than_their_width_do_not_overlap() -> None:
     camera = CAMERAS[0]
     wide_deg = 2 * np.degrees(np.arctan(320 / 500))
     for angle_deg, expected in ((wide_deg - 9.0, True), (wide_deg + 1.0, False)):
-        turn = Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
-        turned = RigidTransform.from_matrix(turn, np.zeros(3))
+        turned = rigid([0.0, np.deg2rad(angle_deg), 0.0], np.zeros(3))
         assert views_can_overlap(camera, RigidTransform.identity(), camera, turned) == expected

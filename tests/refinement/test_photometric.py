@@ -11,7 +11,6 @@ from camera_models import CAMERAS
 from numpy.typing import NDArray
 from poses import displaced, error_vector, random_pose
 from scipy.ndimage import map_coordinates
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.poses import perturbed
@@ -273,8 +272,7 @@ def test_whitened_steps_change_the_image_equally() -> None:
 
 def test_squared_distance_is_that_of_the_step_between_the_poses() -> None:
     rng = np.random.default_rng(0)
-    new = RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
-    root = rng.normal(size=(6, 6))
+    new, root = random_pose(rng), rng.normal(size=(6, 6))
     covariance = root @ root.T
     step = 1e-4 * rng.normal(size=6)
     expected = step @ np.linalg.solve(covariance, step)
