@@ -17,7 +17,7 @@ from published import delg_variables
 from pydantic import ValidationError
 from safetensors.torch import save_file
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.features.global_networks import (
     ApGem,
     Delg,
@@ -267,5 +267,3 @@ def test_apgem_whitens(make: Make) -> None:
     parts = torch.load(FILES["apgem"], weights_only=True)
     whiten = whitening_from(parts, "Landmarks_clean", "w.pt", power=0.25)
     np.testing.assert_allclose(result, whiten(torch.from_numpy(plain)[None])[0], atol=1e-6)
-    with pytest.raises(OptionError, match=r"no whitening 'other'; it has Landmarks_clean"):
-        make("apgem", whitening="other").describe(image)

@@ -94,13 +94,6 @@ def test_no_misfit_of_a_wall_seen_straight_on() -> None:
     assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS) is None
 
 
-def test_few_inliers_and_rigs_have_no_misfit() -> None:
-    view = View(Camera.pinhole(64, 48, 50), ALONE, np.zeros((5, 2)), np.ones((5, 3)))
-    pose = Pose(ALONE, 5, 5, np.ones(5, bool))
-    assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS) is None
-    assert focal_misfit(PoseProblem.of([view, view]), pose, OPTIONS) is None
-
-
 def solved(camera: Camera, pixels: Floats, points: Floats) -> Pose | Failure:
     """Estimate pose and camera from an uncertain camera."""
     problem = PoseProblem.of([View(camera, ALONE, pixels, points)])

@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from poses import rigid
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays
@@ -60,19 +61,17 @@ def random_cameras(count: int, seed: int, turn: float = 3.0) -> list[RigidTransf
 def by_all_distances(
     cameras: list[RigidTransform], options: PairsByPosesOptions
 ) -> list[list[int]]:
-    centers = [camera.center() for camera in cameras]
-    # the optical axis in the world: where the camera frame's z axis points
-    axes = [c.inverse().apply(np.array([[0.0, 0, 1]]))[0] - c.center() for c in cameras]
+    centers = np.array([camera.center() for camera in cameras]).reshape(-1, 3)
+    # the optical axis in the world is the last row of the rotation
+    axes = np.array([camera.rotation_matrix()[2] for camera in cameras]).reshape(-1, 3)
+    angles = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    distances = np.where(angles <= options.max_angle_deg, cdist(centers, centers), np.inf)
+    np.fill_diagonal(distances, np.inf)
     result = set()
-    for i in range(len(cameras)):
-        candidates = []
-        for j in range(len(cameras)):
-            distance = float(np.linalg.norm(centers[i] - centers[j]))
-            angle = np.degrees(np.arccos(np.clip(axes[i] @ axes[j], -1, 1)))
-            if i != j and angle <= options.max_angle_deg:
-                candidates.append((distance, j))
-        for _, j in sorted(candidates)[: options.num_neighbours]:
-            result.add((min(i, j), max(i, j)))
+    for i, row in enumerate(distances):
+        for j in np.argsort(row, kind="stable")[: options.num_neighbours].tolist():
+            if row[j] < np.inf:
+                result.add((min(i, j), max(i, j)))
     return [list(pair) for pair in sorted(result)]
 
 
