@@ -115,18 +115,6 @@ def paper_rows() -> list[list[str]]:
     return [row for row in rows if row[0] != "step"]
 
 
-def test_each_statement_of_the_paper_has_its_section_quote_and_files() -> None:
-    rows = paper_rows()
-    assert len(rows) > 30
-    for _, section, quotes, files, ours in rows:
-        assert section and ours and re.fullmatch(r'"[^"]+"(; "[^"]+")*', quotes), quotes
-        named = re.findall(r"`([^`]+)`", files)
-        assert named or files.startswith("["), files
-        for name in named:
-            if name.endswith(".py"):
-                assert (REPOSITORY / "megloc_kapture" / name).is_file(), name
-
-
 def test_quotes_of_the_paper_are_its_words(shared_data: Path) -> None:
     def words(text: str) -> str:
         text = re.sub(r"~?\\cite\{[^}]*\}|\\cref\{para:global\}", "", text)

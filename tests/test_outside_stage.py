@@ -82,9 +82,7 @@ def test_it_is_part_of_the_plan_with_manifest_and_progress(scene: Path, tmp_path
     assert all_kept(run_plan(stages, workspace, last="count_keypoints"))
     # another option, and it alone runs again
     again = run_plan(
-        planned(scene, {"count_keypoints": {"least": 10_000}}),
-        workspace,
-        last="count_keypoints",
+        planned(scene, {"count_keypoints": {"least": 10_000}}), workspace, last="count_keypoints"
     )
     assert [report.name for report in again if report.state == "run"] == ["count_keypoints"]
     assert workspace.path("counts.csv").read_text() == ""

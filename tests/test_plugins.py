@@ -102,22 +102,13 @@ def test_a_plugin_of_another_package_is_found_and_works(outside: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (
-            "nameless",
-            r"'nameless' \(outside_plugin:Nameless\) does not implement Loc.*: it lacks name",
-        ),
-        (
-            "deaf",
-            r"'deaf' \(outside_plugin:Deaf\) does not implement LocalFeatureE.* lacks extract",
-        ),
+        ("nameless", r"'nameless' \(outside_plugin:Nameless\) does not implement L.* lacks name"),
+        ("deaf", r"'deaf' \(outside_plugin:Deaf\) does not implement LocalF.* lacks extract"),
         ("function", r"'function' .* does not implement LocalFeatureExtractor: it is not a class"),
         ("absent", r"'absent' \(outside_plugin:Absent\) cannot be loaded: .*Absent"),
         ("broken", r"'broken' \(outside_plugin_broken:Grid\) cannot be loaded: no licence"),
         ("moody", r"'moody' rejects its options: not today"),
-        (
-            "missing",
-            r"no plugin 'missing' in megloc_kapture.local_features; registered: .*rootsift",
-        ),
+        ("missing", r"no plugin 'missing' in megloc_kapture.local_features; reg.*: .*rootsift"),
     ],
 )
 def test_a_wrong_plugin_is_refused_by_name_with_the_reason(

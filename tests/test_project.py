@@ -69,11 +69,7 @@ def test_the_source_distribution_has_all_that_a_clone_has() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "networks"),
-    [
-        (["eval", "PRESET=classic"], False),
-        (["eval", "PRESET=modern"], True),
-        (["test"], True),
-    ],
+    [(["eval", "PRESET=classic"], False), (["eval", "PRESET=modern"], True), (["test"], True)],
 )
 def test_make_eval_sets_up_no_more_than_its_preset_needs(
     arguments: list[str], networks: bool, tmp_path: Path

@@ -1,25 +1,25 @@
-"""Worlds of known poses, their evaluation in memory, and pages that are checked."""
+"""Worlds of known poses, their evaluation in memory."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation import scoring
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.io.dataset_tables import ImageGroup, Protocol
-from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
+from tests.worlds import one_camera
 
-VOID_ELEMENTS = {"meta", "br", "img"}
+CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
 
 
 @dataclass
@@ -31,6 +31,17 @@ class World:
     conditions: dict[str, str] = field(default_factory=dict)
     statuses: dict[str, LocalizationResult] = field(default_factory=dict)
     mapped: dict[str, RigidTransform] = field(default_factory=dict)
+
+
+def shifted(x_m: float) -> RigidTransform:
+    """A camera at ``-x_m`` that looks along z."""
+    return RigidTransform((1.0, 0.0, 0.0, 0.0), (x_m, 0.0, 0.0))
+
+
+def pose_at(center: Sequence[float], turn_deg: float = 0.0) -> RigidTransform:
+    """A camera at ``center``, turned about its vertical axis."""
+    rotation = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
 
 
 def upright_camera(center: np.ndarray, heading_rad: float) -> RigidTransform:
@@ -83,68 +94,11 @@ def make_world(num_queries: int = 40, seed: int = 0) -> World:
 
 
 def write_kapture(
-    root: Path,
-    images: Sequence[str],
-    poses: Mapping[str, RigidTransform],
-    camera: Camera | None = None,
+    root: Path, images: Sequence[str], poses: Mapping[str, RigidTransform], camera: Camera = CAMERA
 ) -> Path:
     """A kapture folder of one camera: all ``images`` recorded, ``poses`` as trajectories."""
-    sensor = Sensor.from_camera(camera or Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
-    stamped = dict(enumerate(sorted(images)))
-    data = KaptureData(
-        sensors={"cam0": sensor},
-        rigs={},
-        trajectories={(t, "cam0"): poses[i] for t, i in stamped.items() if i in poses},
-        records_camera={(t, "cam0"): image for t, image in stamped.items()},
-        records_depth={},
-    )
-    write_sensors(root, data)
+    write_sensors(root, one_camera(sorted(images), poses, camera=camera))
     return root
-
-
-class Page(HTMLParser):
-    """Checks that elements close in order; collects ids, references and the visible text."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.ids: list[str] = []
-        self.references: list[str] = []
-        self.pieces: list[str] = []
-        self.feed(html)
-        self.close()
-        assert self.open == []
-        # every reference is an id of the page, data inside it, or the 3D view in the same folder
-        assert len(self.ids) == len(set(self.ids))
-        for reference in self.references:
-            ours = reference.startswith("data:") or reference == "view.html"
-            assert ours or reference.removeprefix("#") in self.ids
-
-    @property
-    def text(self) -> str:
-        return " ".join(" ".join(self.pieces).split())
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.note(attrs)
-        if tag not in VOID_ELEMENTS:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.note(attrs)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.pieces.append(data)
-
-    def note(self, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if name == "id":
-                self.ids.append(value or "")
-            elif name in ("href", "xlink:href", "src"):
-                self.references.append(value or "")
-            self.references += re.findall(r"url\(([^)]*)\)", value or "")
 
 
 def evaluate_poses(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import WRONG_CONVENTIONS
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.check import CheckReport, Finding, Reference, check_submission
@@ -19,15 +19,6 @@ from megloc_kapture.io.dataset_tables import (
     World,
 )
 from megloc_kapture.values import RigidTransform
-
-OPENGL = np.diag([1.0, -1.0, -1.0])
-CONVENTIONS = {
-    "inverted": "poses inverted (camera-to-world",
-    "axes": "poses read with OpenGL's axes",
-    "inverted+axes": "poses inverted and with OpenGL's axes",
-    "centre": "translations read as camera centres",
-    "xyzw": "quaternions read as x, y, z, w",
-}
 
 Poses = dict[str, RigidTransform]
 Check = Callable[..., CheckReport]
@@ -71,22 +62,12 @@ def made(make: Callable[..., Poses]) -> tuple[Reference, Poses]:
     ), poses
 
 
-def lines_of(poses: Mapping[str, RigidTransform], mistake: str = "") -> list[str]:
-    """Rows of a pose file, written by scipy and matrices, with a mistake in all of them."""
-    lines = []
-    for name, pose in poses.items():
-        rotation, translation = pose.rotation_matrix(), np.array(pose.translation)
-        if "axes" in mistake:
-            rotation, translation = OPENGL @ rotation, OPENGL @ translation
-        center = -rotation.T @ translation
-        if "inverted" in mistake:
-            rotation = rotation.T
-        if "inverted" in mistake or mistake == "centre":
-            translation = center
-        quat = Rotation.from_matrix(rotation).as_quat()
-        quat = quat if mistake == "xyzw" else np.roll(quat, 1)
-        lines.append(" ".join([name, *map(repr, map(float, (*quat, *translation)))]) + "\n")
-    return lines
+def lines_of(poses: Mapping[str, RigidTransform]) -> list[str]:
+    """Rows of a pose file."""
+    return [
+        " ".join([name, *map(repr, map(float, (*pose.quat_wxyz, *pose.translation)))]) + "\n"
+        for name, pose in poses.items()
+    ]
 
 
 @pytest.fixture
@@ -117,8 +98,9 @@ def test_the_five_conventions(check: Check, scene: Callable[..., Poses]) -> None
     reference, poses = made(scene)
     report = check(lines_of(poses), reference)
     assert report.lines() == ["40 poses of 40 queries: no problem found"]
-    for mistake, words in CONVENTIONS.items():
-        error = only(check(lines_of(poses, mistake), reference))
+    for words, convert in WRONG_CONVENTIONS.items():
+        wrong = {name: convert(pose) for name, pose in poses.items()}
+        error = only(check(lines_of(wrong), reference))
         assert (error.severity, error.kind) == ("error", "convention") and words in error.message
 
 

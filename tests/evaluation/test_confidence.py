@@ -6,17 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scored import evaluate_poses
+from scored import evaluate_poses, shifted
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.metrics import calibration_error, reliability, risk_by_score
 from megloc_kapture.evaluation.report.reports import report_text
-from megloc_kapture.values import LocalizationResult, RigidTransform
-
-
-def at(x_m: float) -> RigidTransform:
-    return RigidTransform((1.0, 0.0, 0.0, 0.0), (x_m, 0.0, 0.0))
+from megloc_kapture.values import LocalizationResult
 
 
 def test_calibration_error() -> None:
@@ -38,16 +34,13 @@ def test_risk_by_hand() -> None:
 
 def status(image: str, confidence: float | None, localized: bool = True) -> LocalizationResult:
     return LocalizationResult(
-        name=image,
-        reason="" if localized else "too little",
-        num_inliers=10,
-        confidence=confidence,
+        name=image, reason="" if localized else "too little", num_inliers=10, confidence=confidence
     )
 
 
 def test_confidence_of_a_result() -> None:
-    truth = {name: at(0.0) for name in "abcd"}
-    result = {"a": at(0.1), "b": at(100.0), "c": at(0.2), "stray": at(0.0)}
+    truth = {name: shifted(0.0) for name in "abcd"}
+    result = {"a": shifted(0.1), "b": shifted(100.0), "c": shifted(0.2), "stray": shifted(0.0)}
     statuses = {
         "a": status("a", 0.9),
         "b": status("b", 0.6),
@@ -72,15 +65,17 @@ def test_confidence_of_a_result() -> None:
     assert "2 of 4 poses with a confidence are wrong" in text
     assert evaluation.to_pandas().loc["a", "confidence"] == 0.9
     # a result without confidences says nothing of them
-    evaluation = evaluate_poses({"a": at(0.0)}, {"a": at(0.0)}, statuses={"a": status("a", None)})
+    evaluation = evaluate_poses(
+        {"a": shifted(0.0)}, {"a": shifted(0.0)}, statuses={"a": status("a", None)}
+    )
     assert evaluation.confidence is None and "onfidence:" not in report_text(evaluation)
     assert "confidence" not in evaluation.to_pandas().columns
     with pytest.raises(DataError, match="'a' has a true pose, but is listed"):
-        evaluate_poses({}, {"a": at(0.0)}, nowhere=["a"])
+        evaluate_poses({}, {"a": shifted(0.0)}, nowhere=["a"])
 
 
 def test_recall_above_a_confidence() -> None:
-    truth = {name: at(float(row)) for row, name in enumerate("abcd")}
+    truth = {name: shifted(float(row)) for row, name in enumerate("abcd")}
     statuses = {
         name: status(name, confidence)
         for name, confidence in zip("abc", (0.9, 0.6, 0.59), strict=True)
@@ -104,7 +99,7 @@ def test_recall_above_a_confidence() -> None:
 def test_confidences_of_a_pose_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     poses = tmp_path / "poses.txt"
     poses.write_text("a 1 0 0 0 0 0 0\nb 1 0 0 0 50 0 0\n")
-    truth = {"a": at(0.0), "b": at(0.0)}
+    truth = {"a": shifted(0.0), "b": shifted(0.0)}
     assert evaluate(poses, truth).confidence is None
     (tmp_path / "poses.txt.json").write_text('{"confidence": {"a": 0.9, "b": 0.2}, "preset": "x"}')
     known = evaluate(poses, truth).confidence

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import random_pose
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.evaluation.pose_files import (
@@ -164,32 +164,13 @@ def test_names_by_path_end_and_other_suffix() -> None:
 
 def test_relative_poses_are_query_from_reference() -> None:
     rng = np.random.default_rng(0)
-    turns = Rotation.random(2, random_state=0)
-    centers = rng.normal(size=(2, 3)) * 1e3
-    query, reference = (
-        RigidTransform.from_matrix(turn.as_matrix(), -turn.apply(center))
-        for turn, center in zip(turns, centers, strict=True)
-    )
+    query, reference = random_pose(rng), random_pose(rng)
     result = relative_pose(query, reference)
     point = rng.normal(size=(1, 3)) * 1e3
     np.testing.assert_allclose(result.apply(reference.apply(point)), query.apply(point), atol=1e-9)
     scaled = relative_pose(query, reference, scale=2.5)
     assert scaled.quat_wxyz == result.quat_wxyz
     np.testing.assert_allclose(scaled.translation, 2.5 * np.array(result.translation))
-
-
-def test_lists_of_pairs(tmp_path: Path) -> None:
-    path = tmp_path / "pairs.txt"
-    path.write_bytes(b"1600000000000000000 1600000000000000001\r\n\r\n3\t4")
-    assert read_mlad_file(path) == [
-        RelativePose(1600000000000000000, 1600000000000000001),
-        RelativePose(3, 4),
-    ]
-    # and true poses of training files
-    path.write_text(GOOD_PAIR + "100 206 0 0 0 0 0 0 1\n")
-    first, second = read_mlad_file(path)
-    assert first.query_from_reference == RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
-    assert second == RelativePose(100, 206, HERE)
 
 
 def test_provenance_has_options_and_the_hash_of_the_file(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import random_pose
 from scored import write_kapture
 
 from megloc_kapture.errors import DataError
@@ -242,11 +242,7 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
 
 def test_alignment() -> None:
     rng = np.random.default_rng(0)
-    turns = Rotation.random(10, random_state=0).as_matrix()
-    true = {
-        f"{n}.jpg": RigidTransform.from_matrix(turn, rng.normal(size=3))
-        for n, turn in enumerate(turns)
-    }
+    true = {f"{n}.jpg": random_pose(rng) for n in range(10)}
     world = World(official_from_local=SimilarityTransform(scale=3.7, translation=(9.0, -5.0, 2.0)))
     moved = {name: world.pose_in_official(pose) for name, pose in true.items()}
     actual = evaluate(moved, true)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scored import evaluate_poses, write_kapture
+from scored import evaluate_poses, pose_at, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate_results
@@ -115,12 +115,6 @@ FILE = "relocalizationFile_recording_a_to_recording_b.txt"
 Poses = dict[str, RigidTransform]
 
 
-def pose_at(center: list[float], turn_deg: float = 0.0) -> RigidTransform:
-    """A camera at ``center``, turned about its vertical axis."""
-    rotation = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
-    return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
-
-
 def pairs_of(queries: list[str], reference: str = "ref/0.png") -> list[RelocalizationPair]:
     return [RelocalizationPair(FILE, reference, query) for query in queries]
 
@@ -187,45 +181,33 @@ def test_mlad_pairs_and_conditions() -> None:
     assert actual.by_center.row().num_queries == 4
 
 
-@pytest.fixture
-def challenge(tmp_path: Path) -> tuple[Path, Path]:
-    """A workspace with two relocalization files, one query of six without a pose; a result."""
+def test_pose_files_and_folders_have_equal_figures(tmp_path: Path) -> None:
+    """Two relocalization files; one query of six has no pose."""
     rng = np.random.default_rng(4)
-    workspace, files, tables = tmp_path / "workspace", tmp_path / "submission", []
-    reference_of = {"b": "a/100.png", "c": "a/200.png"}
+    workspace, files = tmp_path / "workspace", tmp_path / "submission"
     references = {f"a/{i}.png": pose_at([i, 0.0, 0.0], 10.0 * i) for i in (100, 200)}
-    names = [f"b/{i}.png" for i in (103, 104, 105)] + [f"c/{i}.png" for i in (206, 207, 208)]
+    names = [*(f"b/{i}.png" for i in (103, 104, 105)), *(f"c/{i}.png" for i in (206, 207, 208))]
     truth = {n: pose_at([int(n[2:5]) + 1.0, 0.5, 2.0], 5.0 * int(n[2:5])) for n in names}
     estimated = {
-        name: pose_at((pose.center() + rng.normal(size=3) * 0.1).tolist(), 5.0 * int(name[2:5]) + 1)
+        name: pose_at(pose.center() + rng.normal(size=3) * 0.1, 5.0 * int(name[2:5]) + 1)
         for name, pose in list(truth.items())[:-1]
     }
     write_kapture(workspace / "mapping", list(references), references)
     write_kapture(workspace / "query_gt", names, truth)
     write_kapture(workspace / "localized", names, estimated)
     write_protocol(workspace / "megloc", protocol_of("4seasons"))
+    pairs = [
+        RelocalizationPair(f"reloc_{name[0]}.txt", f"a/{name[2]}00.png", name) for name in names
+    ]
+    write_relocalization(workspace / "megloc", pairs)
     files.mkdir()
-    for letter, reference in reference_of.items():
-        own_names = [name for name in names if name[0] == letter]
-        tables += [RelocalizationPair(f"reloc_{letter}.txt", reference, name) for name in own_names]
+    for file in ("reloc_b.txt", "reloc_c.txt"):
+        asked = [(p.reference, p.query) for p in pairs if p.file == file and p.query in estimated]
         rows = [
-            RelativePose(
-                int(reference[2:5]),
-                int(name[2:5]),
-                relative_pose(estimated[name], references[reference]),
-            )
-            for name in own_names
-            if name in estimated
+            RelativePose(int(r[2:5]), int(q[2:5]), relative_pose(estimated[q], references[r]))
+            for r, q in asked
         ]
-        (files / f"reloc_{letter}.txt").write_text(format_mlad_file(rows))
-    write_relocalization(workspace / "megloc", tables)
-    return workspace, files
-
-
-def test_pose_files_and_folders_have_equal_figures(
-    challenge: tuple[Path, Path], tmp_path: Path
-) -> None:
-    workspace, files = challenge
+        (files / file).write_text(format_mlad_file(rows))
     rules = benchmark_of(workspace / "megloc")
     results = [workspace / "localized", files]
     folder, submitted = evaluate_results(results, workspace / "query_gt", rules)
@@ -234,10 +216,7 @@ def test_pose_files_and_folders_have_equal_figures(
     assert folder.thresholds == THRESHOLDS
     # one file of two: the other file's pairs have no pose
     (half,) = evaluate_results(
-        [files / "reloc_b.txt"],
-        workspace / "query_gt",
-        rules,
-        mapping=workspace / "mapping",
+        [files / "reloc_b.txt"], workspace / "query_gt", rules, mapping=workspace / "mapping"
     )
     assert half.row("b").num_missing == 0
     assert half.row("c").num_missing == 3

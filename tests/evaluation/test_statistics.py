@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
-from scored import evaluate_poses
+from scored import evaluate_poses, shifted
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.comparison import (
@@ -30,7 +30,7 @@ def result(label: str, errors_m: Sequence[float], **options: Any) -> Evaluation:
     """A result whose queries are off by these metres; infinite: no pose."""
     names = [f"{i:04d}.jpg" for i in range(len(errors_m))]
     estimated = {
-        name: RigidTransform((1.0, 0.0, 0.0, 0.0), (error, 0.0, 0.0))
+        name: shifted(error)
         for name, error in zip(names, errors_m, strict=True)
         if np.isfinite(error)
     }

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from scored import Page, write_kapture
+from scored import write_kapture
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.comparison import (
@@ -114,7 +114,7 @@ def test_a_single_result_and_one_without_poses(second: Result) -> None:
     assert "No true poses were given." in text and "agree (%)" not in text
     result = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
     assert result.evaluations[0].rows[0].num_missing == 1
-    assert "From above" not in Page(render_report(result)).text
+    assert "From above" not in render_report(result)
 
 
 def test_empty_or_equal_labels_are_refused(first: Result) -> None:

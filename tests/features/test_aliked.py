@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,13 +11,7 @@ from images import Image
 from kornia.feature import ALIKED
 from published import Tensors, random_tensors
 
-from megloc_kapture.features import aliked
-from megloc_kapture.features.aliked import (
-    _VALUES_AT_ONCE,
-    Aliked,
-    AlikedOptions,
-    aliked_from,
-)
+from megloc_kapture.features.aliked import _VALUES_AT_ONCE, Aliked, AlikedOptions, aliked_from
 
 
 @pytest.fixture
@@ -53,31 +46,6 @@ def test_keypoints_equal_kornia(
     np.testing.assert_allclose(ours.descriptors[row], theirs.descriptors.numpy(), atol=1e-4)
     # the authors' suppression keeps a few maxima that kornia drops
     assert theirs.n <= len(ours.scores) <= 1.2 * theirs.n
-
-
-@pytest.mark.usefixtures("weights")
-def test_peaks_lie_at_pixel_centres_above_the_threshold_and_off_the_border(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    scores = torch.full((40, 50), 0.01)
-    for x, y, score in ((20, 10, 0.9), (35, 30, 0.6), (1, 20, 0.8), (30, 5, 0.15)):
-        scores[y - 1 : y + 2, x - 1 : x + 2] = score / 2
-        scores[y, x] = score
-    maps = SimpleNamespace(scores=scores)
-
-    class Net:
-        def __call__(self, image: torch.Tensor) -> list[SimpleNamespace]:
-            return [maps]
-
-        def desc_head(self, _: object, xy: torch.Tensor) -> torch.Tensor:
-            return torch.ones(len(xy), 128)
-
-    monkeypatch.setattr(aliked.Aliked, "network", lambda *_: (Net(), torch.device("cpu")))
-    result = extractor().extract(np.zeros((40, 50, 3), np.uint8))
-    # the peak at x = 1 is too close to the border, the last peak too weak
-    np.testing.assert_allclose(
-        result.keypoints_px, [[20.5, 10.5, 0.9], [35.5, 30.5, 0.6]], atol=1e-5
-    )
 
 
 def calm_tensors(variant: str) -> Tensors:

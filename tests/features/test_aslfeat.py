@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,57 +20,14 @@ from megloc_kapture.features.aslfeat import (
     on_no_edge,
     peakiness,
 )
-from megloc_kapture.values import LocalFeatures
 
-# written by make_reference.py in the same folder
+# written by TensorFlow, see tests/nets/data/README.md
 TENSORFLOW = Path(__file__).parent.parent / "nets" / "data" / "aslfeat"
-OnMaps = Callable[..., LocalFeatures]
 
 
 def extractor(weights: Path, **options: object) -> AslFeat:
     given = {"weights": str(weights), "device": "cpu", **options}
     return AslFeat(AslFeatOptions.model_validate(given))
-
-
-@pytest.fixture
-def on_maps(monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path) -> OnMaps:
-    """Return a function that extracts keypoints of given maps."""
-
-    def extracted(scores: torch.Tensor, features: torch.Tensor | None = None) -> LocalFeatures:
-        height, width = scores.shape
-        if features is None:
-            features = torch.ones(128, -(-height // 4), -(-width // 4))
-        given = (lambda _: [AslFeatMaps(scores, features)]), torch.device("cpu")
-        monkeypatch.setattr(aslfeat.AslFeat, "network", lambda *_: given)
-        image = np.zeros((height, width, 3), np.uint8)
-        image[0] = 255  # images without contrast are skipped
-        return extractor(aslfeat_weights).extract(image)
-
-    return extracted
-
-
-def blobs(centres: list[tuple[float, float]], heights: list[float]) -> torch.Tensor:
-    """Score map of 60 x 80 with round peaks of 2 px around (x, y), integers at pixel centres."""
-    rows, columns = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
-    scores = torch.full((60, 80), 0.1)
-    for (x, y), height in zip(centres, heights, strict=True):
-        scores += (height - 0.1) * torch.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 8)
-    return scores
-
-
-def test_keypoints_are_the_centres_of_blobs(on_maps: OnMaps) -> None:
-    centres = [(20.0, 30.0), (50.3, 20.0), (60.25, 45.6)]
-    result = on_maps(blobs(centres, [2.0, 1.5, 1.0]))
-    # a blob at a pixel's centre lies at half a pixel in COLMAP's coordinates
-    np.testing.assert_allclose(result.keypoints_px[:, :2], np.array(centres) + 0.5, atol=0.05)
-    np.testing.assert_allclose(result.keypoints_px[0, :2], [20.5, 30.5], atol=1e-4)
-    np.testing.assert_allclose(result.scores[0], 2.0, atol=1e-3)
-
-
-def test_weak_peaks_and_peaks_at_the_border_are_no_keypoints(on_maps: OnMaps) -> None:
-    centres = [(4.0, 30.0), (5.0, 45.0), (75.0, 20.0), (74.0, 40.0), (40.0, 30.0)]
-    result = on_maps(blobs(centres, [2.0, 1.5, 2.0, 1.2, 0.4]))
-    np.testing.assert_allclose(result.keypoints_px[:, :2], [[5.5, 45.5], [74.5, 40.5]], atol=0.01)
 
 
 @pytest.mark.parametrize("image", ["even", "odd"])

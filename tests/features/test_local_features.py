@@ -6,7 +6,6 @@ import hashlib
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features.aliked import Aliked
 from megloc_kapture.features.aslfeat import AslFeat
 from megloc_kapture.features.kornia_features import XFeat
-from megloc_kapture.features.network import LocalNetwork
 from megloc_kapture.features.r2d2 import R2D2
 from megloc_kapture.features.rootsift import ColmapSift, RootSift
 from megloc_kapture.features.superpoint import SuperPoint
@@ -136,23 +134,6 @@ def test_the_limit_keeps_the_best(
         assert_same(pickle.loads(packed).extract(image), every, slice(20))
     if weights is not None:
         assert make().weights() == {weights.name: hashlib.sha256(weights.read_bytes()).hexdigest()}
-
-
-def test_equal_scores_are_ordered_by_y_then_x() -> None:
-    xy_px = np.array([[3.5, 1.5], [0.5, 1.5], [2.5, 0.5], [1.5, 2.5]], np.float32)
-    scores = np.array([0.5, 0.5, 0.9, 0.5], np.float32)
-    table = np.column_stack([xy_px, scores])
-
-    def best(mask: Image | None, most: int) -> tuple[list[int], int]:
-        network: Any = SimpleNamespace(options=SimpleNamespace(max_keypoints=most))
-        result = LocalNetwork._best(network, table, scores, lambda rows: rows, mask)
-        return result.descriptors.tolist(), result.num_masked
-
-    assert best(None, 10) == ([2, 1, 0, 3], 0)
-    assert best(None, 2) == ([2, 1], 0)
-    mask = np.ones((3, 4), bool)
-    mask[0, 2] = mask[1, 0] = mask[2, 1] = False
-    assert best(mask, 2) == ([0], 3)
 
 
 def test_the_mask_is_applied_before_the_limit(

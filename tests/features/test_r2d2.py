@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from images import Image
 from pydantic import ValidationError
 
 from megloc_kapture.features.r2d2 import R2D2, R2D2Options, pyramid_levels
@@ -18,11 +17,6 @@ from megloc_kapture.io.kapture import KaptureFolder
 @pytest.fixture(scope="module")
 def weights(shared_data: Path) -> str:
     return str(shared_data / "weights" / "r2d2" / "r2d2_WASF_N16.pt")
-
-
-@pytest.fixture(scope="module")
-def cropped(photograph: Image) -> Image:
-    return np.ascontiguousarray(photograph[300:410, 600:760])
 
 
 def extractor(weights: str, **options: object) -> R2D2:
@@ -56,20 +50,6 @@ def test_the_coarsest_level_equals_the_published_keypoints(shared_data: Path, we
     np.testing.assert_allclose(result.keypoints_px[:, 2], stored[0, 2], rtol=1e-3)
 
 
-def test_keypoints_have_scales_of_levels_and_pass_both_thresholds(
-    weights: str, cropped: Image
-) -> None:
-    whole = extractor(weights).extract(cropped)
-    assert (whole.scores >= 0.49).all() and (whole.scores <= 1).all()
-    # levels of 160 and 135 pixels
-    scales = np.unique(whole.keypoints_px[:, 2])
-    np.testing.assert_allclose(scales, [32, 32 * 160 / 135], rtol=1e-5)
-    for option, value in (("min_reliability", 0.999), ("min_repeatability", 0.8)):
-        fewer = extractor(weights, **{option: value}).extract(cropped)
-        assert 0 < len(fewer.scores) < len(whole.scores)
-        assert {*map(tuple, fewer.keypoints_px)} < {*map(tuple, whole.keypoints_px)}
-
-
 def test_sizes_without_a_level_between_them_are_refused() -> None:
     with pytest.raises(ValidationError, match=r"max_size must be at least 1\.2 times min_size"):
         R2D2Options(min_size=1000, max_size=1024)
@@ -96,12 +76,3 @@ def test_levels_of_the_pyramid(
     image = torch.zeros(1, 1, *size[::-1])
     levels = pyramid_levels(image, min_size=limits[0], max_size=limits[1])
     assert [(level.shape[-1], level.shape[-2]) for level in levels] == expected
-
-
-def test_pixel_centres_keep_their_place_on_every_level() -> None:
-    width = 640
-    image = (torch.arange(width) + 0.5).expand(1, 1, 16, width)
-    for level in pyramid_levels(image, min_size=256, max_size=1024):
-        x = (torch.arange(level.shape[-1]) + 0.5) * width / level.shape[-1]
-        inner = slice(2, -2)
-        torch.testing.assert_close(level[0, 0, 3, inner], x[inner], atol=0.02, rtol=0)

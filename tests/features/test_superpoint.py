@@ -166,11 +166,8 @@ def test_batch_normalisation_follows_the_activation() -> None:
             x, kernel, weights[f"{name}.conv.bias"], padding=kernel.shape[-1] // 2
         )
         x = x.clamp(min=0) if relu else x
-        mean, var, gain, bias = (
-            weights[f"{name}.bn.{kind}"][:, None, None]
-            for kind in ("running_mean", "running_var", "weight", "bias")
-        )
-        return (x - mean) / (var + 1e-3).sqrt() * gain + bias
+        kinds = ("running_mean", "running_var", "weight", "bias")
+        return functional.batch_norm(x, *(weights[f"{name}.bn.{k}"] for k in kinds), eps=1e-3)
 
     gray = random_gray(45, 58).double()
     x = gray

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_models import CAMERAS, PINHOLE
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from poses import rigid
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.io.colmap import (
@@ -28,13 +29,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]
 Matches = dict[tuple[int, int], NDArray[np.int64]]
-CAMERAS = {
-    "PINHOLE": Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0)),
-    "SIMPLE_RADIAL": Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.08)),
-    "OPENCV_FISHEYE": Camera(
-        "OPENCV_FISHEYE", 640, 480, (400.0, 410.0, 320.0, 240.0, 0.02, -0.01, 0.0, 0.0)
-    ),
-}
+MIXED = [CAMERAS[model] for model in ("PINHOLE", "SIMPLE_RADIAL", "OPENCV_FISHEYE")]
 
 
 def scene(
@@ -47,8 +42,8 @@ def scene(
     images, row_of_point = [], []
     for k in range(num_images):
         camera = cameras[k % len(cameras)]
-        rotation = Rotation.from_rotvec([0.05 * k, 0.12 * (k - num_images / 2), 0.1]).as_matrix()
-        near = RigidTransform.from_matrix(rotation, np.array([0.6 * (k - 2), 0.1 * k, 8.0]))
+        rotation = [0.05 * k, 0.12 * (k - num_images / 2), 0.1]
+        near = rigid(rotation, [0.6 * (k - 2), 0.1 * k, 8.0])
         pixels = px_from_cam(camera, near.apply(points))
         assert (pixels > 0).all() and (pixels < (camera.width, camera.height)).all()
         order = rng.permutation(num_points)
@@ -70,12 +65,12 @@ def assert_recovered(result: TriangulatedPoints, points: Array) -> None:
 @pytest.fixture(scope="module")
 def triangulated() -> TriangulatedPoints:
     """The points of the scene of all cameras."""
-    _, images, matches = scene(*CAMERAS.values())
+    _, images, matches = scene(*MIXED)
     return triangulate(images, matches)
 
 
 def test_points_are_recovered_by_cameras_of_all_models(triangulated: TriangulatedPoints) -> None:
-    points, _, _ = scene(*CAMERAS.values())
+    points, _, _ = scene(*MIXED)
     assert_recovered(triangulated, points)
     assert len(triangulated.point_ids) == 5 * 40  # every point is seen in every image
     assert triangulated.errors_px.shape == (40,) and triangulated.errors_px.max() < 1e-3
@@ -83,7 +78,7 @@ def test_points_are_recovered_by_cameras_of_all_models(triangulated: Triangulate
 
 def test_earth_centred_coordinates_lose_nothing(triangulated: TriangulatedPoints) -> None:
     offset, near = np.array([4.2e6, 1.7e5, 4.78e6]), triangulated
-    points, images, matches = scene(*CAMERAS.values(), offset=offset)
+    points, images, matches = scene(*MIXED, offset=offset)
     result = triangulate(images, matches)
     assert_recovered(result, points)
     np.testing.assert_allclose(result.xyz - offset, near.xyz, atol=1e-5)
@@ -93,7 +88,7 @@ def test_earth_centred_coordinates_lose_nothing(triangulated: TriangulatedPoints
 def test_observations_are_the_matched_keypoints_sorted_by_point_and_image(
     triangulated: TriangulatedPoints,
 ) -> None:
-    points, images, _ = scene(*CAMERAS.values())
+    points, images, _ = scene(*MIXED)
     result = triangulated
     nearest = np.linalg.norm(result.xyz[:, None] - points, axis=2).argmin(axis=1)
     for point, image, keypoint in zip(
@@ -111,14 +106,14 @@ def test_observations_are_the_matched_keypoints_sorted_by_point_and_image(
 
 
 def test_without_images_or_matches_there_are_no_points() -> None:
-    _, images, _ = scene(CAMERAS["PINHOLE"])
+    _, images, _ = scene(PINHOLE)
     for nothing in (triangulate([], {}), triangulate(images, {})):
         assert nothing.xyz.shape == (0, 3) and nothing.errors_px.shape == (0,)
         assert len(nothing.point_ids) == len(nothing.image_ids) == len(nothing.keypoint_ids) == 0
 
 
 def test_tracks_of_two_images_are_optional() -> None:
-    points, images, matches = scene(CAMERAS["PINHOLE"])
+    points, images, matches = scene(PINHOLE)
     two = {(1, 3): matches[1, 3]}
     assert len(triangulate(images, two).xyz) == 0
     kept = triangulate(images, two, TriangulationOptions(two_view_tracks=True))
@@ -127,7 +122,7 @@ def test_tracks_of_two_images_are_optional() -> None:
 
 
 def test_observations_with_a_large_reprojection_error_are_dropped() -> None:
-    points, images, matches = scene(CAMERAS["PINHOLE"])
+    points, images, matches = scene(PINHOLE)
     keypoints = images[0].keypoints_px.copy()
     wrong = np.arange(len(keypoints)) % 2 == 0
     keypoints[wrong] += (0.0, 12.0)  # across the epipolar lines
@@ -138,7 +133,7 @@ def test_observations_with_a_large_reprojection_error_are_dropped() -> None:
 
 
 def test_nearly_parallel_rays_give_no_point() -> None:
-    points, images, _ = scene(CAMERAS["PINHOLE"], num_images=3)
+    points, images, _ = scene(PINHOLE, num_images=3)
     first = images[0]
     close = [
         replace(first, name=f"{k}.jpg", cam_from_world=shift @ first.cam_from_world)
@@ -152,7 +147,7 @@ def test_nearly_parallel_rays_give_no_point() -> None:
 
 
 def test_keypoints_may_have_more_columns_and_an_image_no_keypoints() -> None:
-    points, images, matches = scene(CAMERAS["PINHOLE"], num_images=4)
+    points, images, matches = scene(PINHOLE, num_images=4)
     wide = [
         replace(image, keypoints_px=np.pad(image.keypoints_px, ((0, 0), (0, 2))))
         for image in images
@@ -168,7 +163,7 @@ def test_colmap_prints_nothing_and_leaves_no_files(
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("MEGLOC_COLMAP_LOG", raising=False)
-    _, images, matches = scene(CAMERAS["PINHOLE"])
+    _, images, matches = scene(PINHOLE)
     assert len(triangulate(images, matches).xyz) == 40
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
@@ -218,7 +213,7 @@ def test_groups_with_fewer_than_30_common_points_become_two_models(
 def test_a_disk_without_room_for_the_database_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, images, _ = scene(CAMERAS["PINHOLE"])
+    _, images, _ = scene(PINHOLE)
     full = shutil.disk_usage(tmp_path)._replace(free=1 << 19)
     monkeypatch.setattr("megloc_kapture.io.colmap.disk_usage", lambda path: full)
     with pytest.raises(OutputError, match="0 MB are free, COLMAP's database needs 1 MB"):

@@ -19,11 +19,9 @@ from megloc_kapture.io.images import (
     is_image,
     photo_of,
     pillow_pixels,
-    read_depth_map,
     read_image_rgb,
     read_photo,
     turned_upright,
-    write_depth_map,
     write_image,
 )
 from megloc_kapture.values import Camera
@@ -82,17 +80,6 @@ def test_the_used_range_of_deep_images_becomes_8_bits(
     with Image.open(tmp_path / name) as image:
         assert np.array_equal(pillow_pixels(image), pixels)
     assert capfd.readouterr().err == ""
-
-
-def test_depth_maps_read_back(tmp_path: Path) -> None:
-    depth, path = np.array([[1.5, -1, 0], [2, 3, np.inf]]), tmp_path / "a" / "x.depth"
-    write_depth_map(path, depth.T.copy().T)
-    read = read_depth_map(path, width=3, height=2)
-    assert read.dtype == np.float32
-    assert np.array_equal(read, depth.astype(np.float32))
-    read[0, 0] = 7  # a copy that the caller may change
-    path.write_bytes(b"\xef\xbb\xbf\x3f")  # begins like a byte order mark
-    assert read_depth_map(path, width=1, height=1).shape == (1, 1)
 
 
 # -------------------------------------------------------------------------------------- photographs

@@ -21,13 +21,7 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
-from megloc_kapture.values import (
-    Failure,
-    LocalizationResult,
-    Pose,
-    PoseRefinement,
-    RigidTransform,
-)
+from megloc_kapture.values import Failure, LocalizationResult, Pose, PoseRefinement, RigidTransform
 
 COLUMNS = ("image", "reason")
 

@@ -100,12 +100,6 @@ def test_the_number_of_views_does_not_matter() -> None:
     assert other == pytest.approx(one, rel=0.02)
 
 
-def test_more_wrong_matches_lower_the_confidence() -> None:
-    for model in calibrations().values():
-        result = [model.probability(terms(50, wrong)) for wrong in (0, 40, 160, 640)]
-        assert result == sorted(result, reverse=True)
-
-
 def test_a_pose_of_random_matches_is_rejected() -> None:
     problem, pose, sources = scene(100, 60)
     result = with_confidence(problem, pose, sources, ERROR_PX, 0.5)

@@ -70,14 +70,6 @@ def test_shared_points_equal_to_sets(rows: list[tuple[int, int, int]], asked: li
     assert shared.tolist() == [[len(mine & other) for other in points] for mine in points]
 
 
-def test_the_index_is_read_only() -> None:
-    xyz = np.zeros((3, 3))
-    index = MapIndex.build(xyz, ("a",), *(np.zeros(1, np.int64),) * 3)
-    for array in (index.xyz, index.offsets, index.keypoint_ids, index.point_ids):
-        assert not array.flags.writeable
-    xyz[0] = 1.0  # the caller's array stays writable
-
-
 def test_observations_of_unknown_images_are_refused() -> None:
     with pytest.raises(ValueError):
         build([(1, 0, 0)], ("a",))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from poses import WRONG_CONVENTIONS
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.mapping.map_check import ObservedKeypoints, camera_fault, map_fault
@@ -70,32 +71,19 @@ def with_params(*params: float, model: str = "PINHOLE") -> Callable[[Map], Map]:
     return each(lambda i: {"camera": Camera(model, 640, 480, params)})
 
 
-def with_translation(pose: RigidTransform, translation: NDArray[np.float64]) -> RigidTransform:
-    x, y, z = translation.tolist()
-    return RigidTransform(pose.quat_wxyz, (x, y, z))
-
-
 def one_with_nan(array: NDArray[np.floating]) -> NDArray[np.floating]:
     changed = array.copy()
     changed[3, 1] = np.nan
     return changed
 
 
-OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
     "keypoints as y, x": (with_pixels(lambda k: k[:, ::-1]), r"read as \(y, x\)"),
     "larger images": (with_pixels(lambda k: k * 1.6), "keypoints multiplied by 0.625"),
-    "world_from_cam": (with_pose(RigidTransform.inverse), r"poses inverted \(camera-to-world"),
-    "xyzw": (
-        with_pose(lambda p: RigidTransform((*p.quat_wxyz[1:], p.quat_wxyz[0]), p.translation)),
-        "quaternions read as x, y, z, w",
-    ),
-    "centres": (with_pose(lambda p: with_translation(p, p.center())), "camera centres"),
-    "OpenGL": (with_pose(lambda p: OPENGL @ p), "OpenGL's axes"),
-    "OpenGL, inverse": (
-        with_pose(lambda p: (OPENGL @ p).inverse()),
-        "inverted and with OpenGL's axes",
-    ),
+    **{
+        words: (with_pose(convert), re.escape(words))
+        for words, convert in WRONG_CONVENTIONS.items()
+    },
     "focal length": (with_params(1000.0, 1020.0, 330.0, 235.0), "focal length 0.5 times as long"),
     "points not finite": (with_points(lambda p: one_with_nan(p)), "1 of 300 points are not finite"),
     "keypoints not finite": (with_pixels(one_with_nan), "keypoints of 00.jpg are not finite"),

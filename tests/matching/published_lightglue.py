@@ -113,18 +113,6 @@ def main() -> None:
             actual[f"scores_{at}_{pair}"] = scores[order].astype(np.float32)
             pruned = int((result["prune0"] < result["prune0"].max()).sum())
             actual[f"stop_{at}_{pair}"] = np.array([result["stop"], pruned], np.int16)
-            print(
-                depth,
-                width,
-                pair,
-                len(order),
-                "stop",
-                result["stop"],
-                "pruned",
-                pruned,
-                scores.min() if len(scores) else "",
-            )
-    DATA.parent.mkdir(exist_ok=True)
     np.savez_compressed(DATA, **actual)
 
 

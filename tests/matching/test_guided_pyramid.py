@@ -68,10 +68,7 @@ def test_no_variant_is_larger_than_the_bound(side: int, expected: list[float]) -
 
 @pytest.mark.parametrize(
     ("name", "values"),
-    [
-        ("scales", [(), (0.0,), (-1.0,), (float("nan"),), (100.0,)]),
-        ("rotations_deg", [(45,), ()]),
-    ],
+    [("scales", [(), (0.0,), (-1.0,), (float("nan"),), (100.0,)]), ("rotations_deg", [(45,), ()])],
 )
 def test_wrong_options_are_refused(name: str, values: list[Any]) -> None:
     for value in values:

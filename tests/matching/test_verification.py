@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 import pytest
-from camera_models import STRONG
+from camera_models import CAMERAS, PINHOLE, STRONG
 from numpy.typing import NDArray
 from poses import rigid
 from scipy.optimize import least_squares
@@ -25,12 +25,7 @@ from megloc_kapture.matching.verification import (
 from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]
-PINHOLE = Camera("PINHOLE", 640, 480, (520.0, 510.0, 320.5, 239.0))
-DISTORTED = [
-    Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.08)),
-    Camera("OPENCV", 640, 480, (520.0, 510.0, 320.5, 239.0, -0.1, 0.02, 1e-3, -5e-4)),
-    Camera("OPENCV_FISHEYE", 640, 480, (400.0, 400.0, 320.0, 240.0, 0.01, -0.003, 0.0, 0.0)),
-]
+DISTORTED = [CAMERAS[model] for model in ("SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")]
 
 
 def undistorted(rays: Array, focal_px: float) -> tuple[Array, Array]:
@@ -89,17 +84,6 @@ def test_the_sampson_distance_is_colmaps() -> None:
     ours = sampson_error_px(*seen(camera, pixels[0]), *seen(camera, pixels[1]), B_FROM_A)
     np.testing.assert_allclose((ours / 500.0) ** 2, expected, rtol=1e-9)
     assert np.median(ours) > 10  # random matches are far from the epipolar lines
-
-
-@pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED, *WIDE], ids=lambda c: c.model)
-def test_slopes_are_the_derivative_of_the_ray_by_the_pixel(camera: Camera) -> None:
-    _, in_a, _ = scene(camera, PINHOLE, count=50)
-    _, slopes = seen(camera, in_a)
-    step = 1e-3
-    for column, shift in enumerate(np.eye(2) * step):
-        ahead, behind = bearing_rays(camera, in_a + shift), bearing_rays(camera, in_a - shift)
-        expected = (ahead - behind)[:, :2] / (2 * step)
-        np.testing.assert_allclose(slopes[:, :, column], expected, rtol=1e-5, atol=1e-9)
 
 
 def smallest_correction_px(

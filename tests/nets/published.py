@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import runpy
 import zlib
 from pathlib import Path
 from typing import TypeVar
@@ -16,6 +17,8 @@ Net = TypeVar("Net", bound=nn.Module)
 Tensors = dict[str, torch.Tensor]
 Shapes = dict[str, tuple[int, ...]]
 FOLDER = Path(__file__).parent
+# random weights by key and shape, which are the same under every version of numpy and torch
+random_state = runpy.run_path(str(FOLDER / "data/deeplabv3plus/make_reference.py"))["random_state"]
 
 
 def published_shapes(name: str) -> Shapes:
@@ -34,7 +37,7 @@ def _read(path: Path) -> Shapes:
 
 
 def delg_variables(kind: str) -> dict[str, NDArray[np.float32]]:
-    """Return the random variables of data/delg/make_reference.py."""
+    """Return the random variables for which data/delg/reference.npz was written."""
     drawn = {}
     words = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_variance")
     for name, shape in delg_shapes(kind).items():

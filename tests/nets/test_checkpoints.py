@@ -14,15 +14,9 @@ from torch import nn
 
 from megloc_kapture.features.aliked import aliked_from
 from megloc_kapture.features.r2d2 import R2D2Network, load_r2d2
-from megloc_kapture.features.superpoint import (
-    SuperPointBatchNormNet,
-    SuperPointNet,
-)
+from megloc_kapture.features.superpoint import SuperPointBatchNormNet, SuperPointNet
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.nets.global_descriptors import (
-    ApGemNet,
-    VggNetVlad,
-)
+from megloc_kapture.nets.global_descriptors import ApGemNet, VggNetVlad
 from megloc_kapture.nets.megaloc import MegaLocNet
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.preprocessing.deeplab import DeepLabV3Plus
@@ -48,11 +42,7 @@ STORED: dict[str, tuple[Callable[[], nn.Module], int | None]] = {
     "r2d2_WASF_N8_big": (lambda: R2D2Network(48), 1_041_019),
     "superpoint-batchnorm": (SuperPointBatchNormNet, None),
 }
-ALIKED = {
-    "aliked-t16": (192_588, 64),
-    "aliked-n16": (678_324, 128),
-    "aliked-n32": (980_468, 128),
-}
+ALIKED = {"aliked-t16": (192_588, 64), "aliked-n16": (678_324, 128), "aliked-n32": (980_468, 128)}
 R2D2_WIDTHS = {"r2d2_WAF_N16": 32, "r2d2_WASF_N16": 32, "r2d2_WASF_N8_big": 48}
 
 

@@ -13,7 +13,7 @@ from published import delg_shapes, delg_variables
 from megloc_kapture.errors import DataError
 from megloc_kapture.nets.delg import DelgNet, Form, delg_from, describe
 
-# written by TensorFlow, see make_reference.py in its folder
+# written by TensorFlow, see data/README.md
 REFERENCE = Path(__file__).parent / "data" / "delg" / "reference.npz"
 SCALES = (0.70710677, 1.0, 1.4142135)
 ENDING = "/.ATTRIBUTES/VARIABLE_VALUE"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import torch
 from emulated_device import emulated_devices
 from numpy.typing import NDArray
 from published import randomised
+from whole_preset_weights import Sizes, write_random_weights
 
 from megloc_kapture.features import global_networks
 from megloc_kapture.features.aliked import Aliked
@@ -26,9 +26,6 @@ from megloc_kapture.matching.networks import LightGlue, SuperGlue
 from megloc_kapture.nets import runtime
 from megloc_kapture.preprocessing.deeplab import DeepLab, DeepLabV3Plus
 from megloc_kapture.values import ImageFeatures
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-from whole_preset_weights import Sizes, write_random_weights  # noqa: E402
 
 DEVICE = "cuda:1"
 HEIGHT, WIDTH = 64, 96

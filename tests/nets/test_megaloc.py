@@ -7,7 +7,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from torch import nn
 from torch.nn import functional
 from transformers import Dinov2Config, Dinov2Model
 
@@ -105,28 +104,20 @@ def sinkhorn(scores: NDArray[np.float64], dustbin: float) -> NDArray[np.float64]
     return (u[:, None] * kernel * v)[:clusters] * (patches + clusters)
 
 
-def perceptron(layers: nn.Sequential, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Linear, ReLU, linear, of the columns of a matrix."""
-    first, last = (layer for layer in layers if hasattr(layer, "weight"))
-    for layer in (first, last):
-        weight = layer.weight.detach().double().numpy().reshape(len(layer.bias), -1)
-        x = weight @ x + layer.bias.detach().double().numpy()[:, None]
-        x = np.maximum(x, 0) if layer is first else x
-    return x
-
-
 def test_the_vector_equals_the_equations_of_salad() -> None:
     net = random_salad()
     patches, whole = random_input()
     result = net(patches, whole).detach().numpy()
     assert result.dtype == np.float32 and result.shape == (2, TOKEN + SIZE * CLUSTERS)
+    exact = random_salad().double()
+    scores, features = exact.score(patches.double()), exact.cluster_features(patches.double())
+    tokens = exact.token_features(whole.double()).detach().numpy()
     for image in range(2):
-        columns = patches[image].flatten(1).double().numpy()
-        shares = sinkhorn(perceptron(net.score, columns), net.dust_bin.item())
-        summed = perceptron(net.cluster_features, columns) @ shares.T
+        shares = sinkhorn(scores[image].flatten(1).detach().numpy(), net.dust_bin.item())
+        summed = features[image].flatten(1).detach().numpy() @ shares.T
         summed /= np.linalg.norm(summed, axis=0)
-        token = perceptron(net.token_features, whole[image].double().numpy()[:, None])[:, 0]
-        expected = np.concatenate([token / np.linalg.norm(token), summed.ravel()])
+        token = tokens[image] / np.linalg.norm(tokens[image])
+        expected = np.concatenate([token, summed.ravel()])
         expected /= np.linalg.norm(expected)
         np.testing.assert_allclose(result[image], expected, atol=2e-6)
 
@@ -225,10 +216,3 @@ def test_positions_are_interpolated_with_the_offset_of_dinov2(rows: int, columns
     result = net.positions(rows, columns).detach()
     torch.testing.assert_close(result[0, 0], learnt[0, 0])
     torch.testing.assert_close(result[0, 1:].T, expected[0].flatten(1), rtol=0, atol=1e-5)
-
-
-def test_incomplete_patches_are_ignored() -> None:
-    net = small_trunk()
-    image = torch.randn(1, 3, 75, 95, generator=torch.Generator().manual_seed(5))
-    torch.testing.assert_close(tokens_of(net, image), tokens_of(net, image[:, :, :70, :84]))
-    assert tokens_of(net, image).shape == (1, 1 + 5 * 6, DINO_CHANNELS)

@@ -13,11 +13,9 @@ from torch.nn import functional
 from megloc_kapture.nets import score_maps
 from megloc_kapture.nets.score_maps import (
     deform_conv2d,
-    parabola_peak,
     pixel_table,
     read_bilinear,
     select_pixels,
-    soft_argmax,
     suppress_non_maxima,
 )
 
@@ -77,30 +75,6 @@ def test_the_mask_comes_before_the_choice_of_the_best() -> None:
     assert result.num_masked == 4
     everything = select_pixels(scores, threshold=0.5)
     assert result.xy.tolist() == everything.xy[4:10].tolist()
-
-
-def test_the_parabola_peak_is_exact_and_at_most_half_a_pixel_away() -> None:
-    rows, columns = torch.meshgrid(*[torch.arange(9, dtype=torch.float64)] * 2, indexing="ij")
-    u, v = columns - 4.2, rows - 3.9
-    centre = torch.tensor([[4, 4]])
-    result = parabola_peak(5 - u * u - 2 * v * v + 0.7 * u * v, centre)
-    torch.testing.assert_close(result, torch.tensor([[4.2, 3.9]], dtype=torch.float64))
-    slope = columns**2 * 0.1 + rows**2 * 0.05
-    assert (parabola_peak(slope, centre) - 4).abs().max() <= 0.5
-    assert parabola_peak(torch.ones(9, 9), centre).tolist() == [[4.0, 4.0]]
-
-
-def test_soft_argmax_by_hand() -> None:
-    scores = torch.zeros(7, 8, dtype=torch.float64)
-    scores[3, 4], scores[3, 5], scores[2, 4] = 0.5, 0.3, 0.2
-    e = torch.exp(scores[2:5, 3:6] / 0.1)
-    expected_x = 4 + float((e[:, 2] - e[:, 0]).sum() / e.sum())
-    expected_y = 3 + float((e[2] - e[0]).sum() / e.sum())
-    result = soft_argmax(scores, torch.tensor([[4, 3]]), 1, 0.1)
-    torch.testing.assert_close(
-        result, torch.tensor([[expected_x, expected_y]], dtype=torch.float64)
-    )
-    assert expected_x > 4 > 3 > expected_y
 
 
 def test_bilinear_reading_equals_grid_sample_inside_and_outside() -> None:

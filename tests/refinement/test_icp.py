@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from megloc_twins.frames import looking_at
-from megloc_twins.rasterization import depth_map, sample_grid, visible_surfaces
-from megloc_twins.surfaces import SurfaceBuilder, Surfaces
+import room
+from corner import pose_at
 from numpy.typing import NDArray
 from poses import displaced, pose_errors, rigid
 from pydantic import ValidationError
@@ -19,7 +18,7 @@ from scenes import Scene
 
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement import icp
-from megloc_kapture.refinement.icp import Icp, IcpOptions, map_cloud, refine_by_icp
+from megloc_kapture.refinement.icp import Icp, IcpOptions, map_cloud
 from megloc_kapture.refinement.icp_surface import depth_cloud
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -30,70 +29,23 @@ WALL_CAMERA = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 WALL_OPTIONS = IcpOptions(max_references=2, voxels_m=(0.05,), max_distances_m=(0.3,))
 WALL_QUERY = DepthView(WALL_CAMERA, np.full((48, 64), 2.0, np.float32), IDENTITY)
 OFFSET = rigid(np.radians([0.5, -1.5, 0.3]), [-0.06, 0.004, 0.01])
-# corner and two edges: a room of 4 x 5 x 2.6 m, floor and walls of a long corridor, a wall
-WALLS = {
-    "room": [
-        ((0, 0, 0), (4, 0, 0), (0, 5, 0)),
-        ((0, 0, 2.6), (4, 0, 0), (0, 5, 0)),
-        ((0, 0, 0), (4, 0, 0), (0, 0, 2.6)),
-        ((0, 5, 0), (4, 0, 0), (0, 0, 2.6)),
-        ((0, 0, 0), (0, 5, 0), (0, 0, 2.6)),
-        ((4, 0, 0), (0, 5, 0), (0, 0, 2.6)),
-    ],
-    "corridor": [
-        ((1, -50, 0), (2, 0, 0), (0, 100, 0)),
-        ((1, -50, 0), (0, 100, 0), (0, 0, 2.6)),
-        ((3, -50, 0), (0, 100, 0), (0, 0, 2.6)),
-    ],
-    "wall": [((-20, 4, -20), (40, 0, 0), (0, 0, 40))],
-}
-BOXES = (
-    ((0.9, 4.2), (0.8, 0.6, 0.75), 0.3),
-    ((2.2, 4.6), (0.5, 0.4, 1.4), -0.2),
-    ((3.3, 3.4), (0.6, 0.9, 0.45), 0.1),
-)
 
 
-def surfaces_of(name: str) -> Surfaces:
-    """Build two-sided walls; the room has three boxes."""
-    builder = SurfaceBuilder()
-    for wall in WALLS[name]:
-        corner, along, across = (np.array(each, np.float64) for each in wall)
-        builder.add(corner, along, across, 0)
-        builder.add(corner, across, along, 0)
-    for at, size, yaw in BOXES if name == "room" else ():
-        builder.add_box(at, size, yaw, (0, 0, 0, 0), 0)
-    return builder.build()
-
-
-def view_from(x: float, y: float, z: float, target: Sequence[float]) -> RigidTransform:
-    position = np.array([x, y, z])
-    ahead = np.array(target, np.float64) - position
-    pitch = np.arctan2(ahead[2], np.hypot(ahead[0], ahead[1]))
-    return looking_at(position, np.arctan2(ahead[1], ahead[0]), pitch, 0.0)
-
-
-QUERY = view_from(2.0, 1.6, 1.5, (2.0, 4.5, 0.7))
+QUERY = pose_at((0.1, -0.2, -1.4), 10, 10)
 REFERENCES = {
-    "map/a.png": view_from(1.5, 1.3, 1.4, (2.2, 4.5, 0.8)),
-    "map/b.png": view_from(2.6, 1.5, 1.6, (1.6, 4.5, 0.6)),
-    "map/c.png": view_from(2.0, 0.9, 1.2, (2.3, 4.5, 0.9)),
-    "map/d.png": view_from(1.2, 2.2, 1.5, (2.6, 4.4, 0.4)),
-    "map/e.png": view_from(2.9, 2.1, 1.3, (1.2, 4.6, 0.5)),
+    "map/a.png": pose_at((-0.4, -0.1, -1.7), 4, 8),
+    "map/b.png": pose_at((0.6, -0.3, -1.5), 22, 14),
+    "map/c.png": pose_at((0.2, -0.6, -1.8), 12, 16),
+    "map/d.png": pose_at((-0.7, -0.2, -0.9), -4, 12),
+    "map/e.png": pose_at((0.8, 0.1, -1.0), 30, 6),
 }
 
 
 def sensed(
-    surfaces: Surfaces,
-    image_from_world: RigidTransform,
-    image_from_depth: RigidTransform,
-    seed: int | None,
+    image_from_world: RigidTransform, image_from_depth: RigidTransform, seed: int
 ) -> DepthView:
     """Render depth with a Kinect's noise, single pixels without depth, and three large holes."""
-    depth_from_world = image_from_depth.inverse() @ image_from_world
-    exact = depth_map(visible_surfaces(surfaces, depth_from_world, sample_grid(DEPTH, 1)))
-    if seed is None:
-        return DepthView(DEPTH, exact, image_from_depth)
+    exact = room.render(image_from_depth.inverse() @ image_from_world, camera=DEPTH).depth_m
     rng = np.random.default_rng(seed)
     deviation = 0.0012 + 0.0019 * (exact - 0.4) ** 2
     depth = np.where(exact > 0, exact + deviation * rng.standard_normal(exact.shape), 0.0)
@@ -104,19 +56,11 @@ def sensed(
     return DepthView(DEPTH, depth.astype(np.float32), image_from_depth)
 
 
-def scene_of(
-    name: str = "room",
-    *,
-    query_offset: RigidTransform = OFFSET,
-    map_offset: RigidTransform = IDENTITY,
-    seed: int | None = 0,
-) -> Scene:
-    """Return a room, corridor or wall; the query is ``query.png``."""
-    surfaces = surfaces_of(name)
-    views = {"query.png": sensed(surfaces, QUERY, query_offset, seed)}
-    for number, (image, pose) in enumerate(REFERENCES.items(), 1):
-        noise_seed = None if seed is None else seed + number
-        views[image] = sensed(surfaces, pose, map_offset, noise_seed)
+def scene_of(query_offset: RigidTransform = OFFSET, map_offset: RigidTransform = IDENTITY) -> Scene:
+    """Return a map of the room; the query is ``query.png``."""
+    views = {"query.png": sensed(QUERY, query_offset, 0)}
+    for seed, (image, pose) in enumerate(REFERENCES.items(), 1):
+        views[image] = sensed(pose, map_offset, seed)
     return Scene(dict(REFERENCES), dict.fromkeys(REFERENCES, COLOUR), views)
 
 
@@ -167,10 +111,11 @@ def test_the_offset_between_depth_and_colour_counts(furnished: Scene) -> None:
     assert pose_errors(wrong.cam_from_world, QUERY)[0] > 0.02
 
 
-@pytest.mark.parametrize(("name", "seed"), [("wall", None), ("corridor", 0)])
-def test_surfaces_that_slide_determine_no_pose(name: str, seed: int | None) -> None:
-    scene, start = scene_of(name, seed=seed), displaced(QUERY, 2, 0.03, 1.0)
-    result = refine(scene, start)
+def test_a_wall_alone_determines_no_pose() -> None:
+    poses = {f"{x}": shifted(x) for x in (-0.5, 0.0, 0.5)}
+    views = dict.fromkeys([*poses, "query.png"], depth_of(2.0))
+    scene, start = Scene(poses, dict.fromkeys(poses, WALL_CAMERA), views), shifted(0.02)
+    result = Icp().refine("query.png", WALL_CAMERA, start, list(poses), scene)
     assert not result.accepted and "do not determine" in result.reason
     assert result.cam_from_world == start and result.covariance is None
 
@@ -213,58 +158,21 @@ def test_poses_without_depth_have_a_reason(furnished: Scene) -> None:
     start, views = displaced(QUERY, 0, 0.05, 3.0), furnished.depths
     assert "no depth" in refine(replace(furnished, depths={}), start).reason
     empty = replace(views["query.png"], depth_m=np.zeros((180, 240), np.float32))
-    nothing_seen = refine(replace(furnished, depths=views | {"query.png": empty}), start)
-    assert "query's depth" in nothing_seen.reason
+    masked = {"query.png": np.zeros((480, 640), bool)}
+    for scene in (
+        replace(furnished, depths=views | {"query.png": empty}),
+        replace(furnished, masks=masked),
+    ):
+        assert "query's depth" in refine(scene, start).reason
     nothing_there = Icp().refine("query.png", COLOUR, start, [], furnished)
     assert "the map has only 0 points" in nothing_there.reason
 
 
-def test_masked_pixels_are_left_out(furnished: Scene) -> None:
-    """A person in front of the query's camera is not in the map."""
-    view = furnished.depths["query.png"]
-    depth = view.depth_m.copy()
-    depth[30:, 68:172] = np.minimum(depth[30:, 68:172], 2.4)
-    views = furnished.depths | {"query.png": replace(view, depth_m=depth)}
-    scene, start = replace(furnished, depths=views), displaced(QUERY, 4, 0.05, 2.0)
-    unmasked = refine(scene, start)
-    mask = np.ones((480, 640), bool)
-    # the two cameras are 6 cm and 1.5 degrees apart
-    mask[40:, 100:540] = False
-    masked = refine(replace(scene, masks={"query.png": mask}), start)
-    assert masked.accepted, masked.reason
-    assert pose_errors(masked.cam_from_world, QUERY)[0] < 0.01
-    assert masked.measures["overlap_after"] > unmasked.measures["overlap_after"] + 0.05
-
-
-def test_dense_map_points_replace_depth(furnished: Scene) -> None:
-    rows, columns = np.indices((180, 240)).reshape(2, -1) + 0.5
-    rays = np.column_stack([(columns - 120) / 219, (rows - 90) / 219, np.ones(len(rows))])
-    exact = scene_of(seed=None).depths
-    points = [
-        pose.inverse().apply(rays * exact[name].depth_m.astype(np.float64).reshape(-1, 1))
-        for name, pose in REFERENCES.items()
-    ]
-    dense = np.concatenate(points)[::3]
+def test_a_map_of_few_points_is_refused(furnished: Scene) -> None:
+    few = np.random.default_rng(0).uniform(*room.ROOM, (4000, 3))
     only_query = {"query.png": furnished.depths["query.png"]}
-    scene, start = (
-        replace(furnished, depths=only_query, points=dense),
-        displaced(QUERY, 5, 0.05, 3.0),
-    )
-    assert_accurate(refine(scene, start))
-    # as few as triangulation makes
-    few = np.random.default_rng(0).permutation(dense)[:1200]
-    sparse = refine(replace(scene, points=few), start)
-    assert not sparse.accepted and "too sparse" in sparse.reason
-
-
-def test_arrays_of_a_corner_are_aligned() -> None:
-    rng = np.random.default_rng(0)
-    corner = rng.uniform(0.0, 1.5, (30000, 3))
-    corner[np.arange(30000), np.arange(30000) % 3] = 0.0
-    truth = view_from(2.5, 2.2, 1.9, (0.0, 0.0, 0.0))
-    query = truth.apply(corner[rng.random(30000) < 0.5])
-    start = rigid(np.radians([1.0, -1.0, 0.5]), [0.02, -0.02, 0.01]) @ truth
-    assert_accurate(refine_by_icp(query, corner, start), 2e-3, 0.05, truth)
+    result = refine(replace(furnished, depths=only_query, points=few), QUERY)
+    assert not result.accepted and "too sparse" in result.reason
 
 
 @pytest.mark.parametrize(

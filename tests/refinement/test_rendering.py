@@ -18,11 +18,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.acceptance import RenderingOptions
 from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
-from megloc_kapture.refinement.rendering import (
-    Rendering,
-    _Refining,
-    refine_by_rendering,
-)
+from megloc_kapture.refinement.rendering import Rendering, _Refining, refine_by_rendering
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()
@@ -39,16 +35,6 @@ def at_night(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the image of a night camera: a fifth of the light, other colours, noise."""
     noise = np.random.default_rng(0).normal(0, 2, image.shape)
     return np.clip(0.2 * image * [1.1, 0.92, 0.75] + noise, 0, 255).astype(np.uint8)
-
-
-def under_lamps(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the image with light of two lamps only, which fades with the distance."""
-    y, x = np.indices(image.shape[:2])
-    gain = 0.15 + sum(
-        np.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * 80**2))
-        for column, row in ((90, 120), (290, 200))
-    )
-    return np.clip(0.8 * gain[..., None] * image, 0, 255).astype(np.uint8)
 
 
 def reference(pose: RigidTransform) -> RenderingReference:
@@ -112,11 +98,6 @@ def test_a_pose_is_refined_despite_gain_colour_and_noise_of_the_night(case: Case
     assert np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) < 0.02
 
 
-def test_a_pose_is_refined_under_lamps(case: Case) -> None:
-    refined = run(showing(case, under_lamps(render(case.truth))), displaced(case.truth, 3, m=0.05))
-    assert_accurate(refined, case.truth, 0.005, 0.1)
-
-
 def test_the_true_pose_is_kept(case: Case) -> None:
     image, _ = occluded(case.query.image, 0)
     for seen in (case, showing(case, image)):
@@ -146,18 +127,6 @@ def test_a_masked_object_changes_nothing(case: Case) -> None:
     result, same = (run(showing(case, i, mask=free), start) for i in (covered, case.query.image))
     assert result.accepted and pose_errors(result.cam_from_world, case.truth)[0] < 0.01
     assert (result.cam_from_world, result.measures) == (same.cam_from_world, same.measures)
-
-
-def test_masked_pixels_of_references_change_nothing(case: Case) -> None:
-    start, result = displaced(case.truth, 2), []
-    for seed in (0, 1):
-        references = []
-        for each in case.references:
-            image, free = occluded(each.image, seed)
-            references.append(replace(each, image=image, mask=free))
-        result.append(run(replace(case, references=tuple(references)), start))
-    assert result[0].accepted
-    assert result[0].cam_from_world == result[1].cam_from_world
 
 
 def test_a_pose_that_the_references_do_not_cover_is_kept(case: Case) -> None:

@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.values import Failure, Pose, RigidTransform
+
+OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+# words of the message about a wrong convention, and a pose in that convention
+WRONG_CONVENTIONS: dict[str, Callable[[RigidTransform], RigidTransform]] = {
+    "poses inverted (camera-to-world": RigidTransform.inverse,
+    "poses read with OpenGL's axes": lambda pose: OPENGL @ pose,
+    "poses inverted and with OpenGL's axes": lambda pose: (OPENGL @ pose).inverse(),
+    "translations read as camera centres": lambda pose: RigidTransform(
+        pose.quat_wxyz, tuple(pose.center().tolist())
+    ),
+    "quaternions read as x, y, z, w": lambda pose: RigidTransform(
+        (*pose.quat_wxyz[1:], pose.quat_wxyz[0]), pose.translation
+    ),
+}
 
 
 def random_pose(rng: np.random.Generator) -> RigidTransform:

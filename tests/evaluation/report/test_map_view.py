@@ -8,16 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scored import evaluate_poses
+from scored import evaluate_poses, shifted
 
 from megloc_kapture.evaluation.report.figures import views_from_above
 from megloc_kapture.evaluation.report.queries import shown_queries, top_view
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.values import RigidTransform
-
-
-def moved(x: float, quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)) -> RigidTransform:
-    return RigidTransform(quat, (x, 0.0, 0.0))
 
 
 def arrays(poses: Iterable[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:
@@ -59,12 +55,12 @@ def test_top_view_of_a_slanted_world(world: Any) -> None:
 
 
 def test_frames_have_separate_figures() -> None:
-    mapped = {f"DUC1/{i}.jpg": moved(i) for i in range(5)}
-    mapped |= {f"DUC2/{i}.jpg": moved(1000.0 + i) for i in range(5)}
+    mapped = {f"DUC1/{i}.jpg": shifted(i) for i in range(5)}
+    mapped |= {f"DUC2/{i}.jpg": shifted(1000.0 + i) for i in range(5)}
     frames = {name: name[:4] for name in mapped}
-    truth = {"a.jpg": moved(1.0), "b.jpg": moved(1002.0), "c.jpg": moved(1003.0)}
+    truth = {"a.jpg": shifted(1.0), "b.jpg": shifted(1002.0), "c.jpg": shifted(1003.0)}
     conditions = {"a.jpg": "DUC1", "b.jpg": "DUC2", "c.jpg": "DUC2"}
-    evaluation = evaluate_poses({"a.jpg": moved(1.5)}, truth, conditions=conditions)
+    evaluation = evaluate_poses({"a.jpg": shifted(1.5)}, truth, conditions=conditions)
     views = views_from_above(shown_queries(evaluation), mapped, frames, "m")
     assert list(views) == ["DUC1", "DUC2"]
     assert b"truth, no pose" in views["DUC2"] and b"truth, no pose" not in views["DUC1"]

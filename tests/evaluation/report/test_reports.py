@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scored import Page, displaced, evaluate_poses, make_world
+from scored import displaced, evaluate_poses, make_world, shifted
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.evaluation.comparison import compare
@@ -31,6 +33,18 @@ def evaluation_of(world: Any) -> Evaluation:
     return evaluate_poses(world.estimated, world.truth, label=label, **options)
 
 
+def visible_text(page: str) -> str:
+    """Return the text of a page that refers to its own elements and to the 3D view alone."""
+    ids = re.findall(r'\bid="([^"]*)"', page)
+    references = re.findall(r'\b(?:href|src)="([^"]*)"', page) + re.findall(r"url\(([^)]*)\)", page)
+    assert len(ids) == len(set(ids)) and references
+    for reference in references:
+        ours = reference.startswith("data:") or reference == "view.html"
+        assert ours or reference.removeprefix("#") in ids, reference
+    text = re.sub(r"<style.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL)
+    return " ".join(html.unescape(text).split())
+
+
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
@@ -47,15 +61,15 @@ def test_names_are_escaped_and_the_steps_of_the_paper_come_first(world: Any) -> 
         {"name": "poses refined by ICP", "on": False, "why": "<no> depth"},
     ]
     provenance = {"root": f"/data/{evil}", "preset": "megloc", "steps": steps}
-    html = render_report(evaluation_of(world), provenance=provenance)
-    assert not any(tag in html for tag in ("<script", "<i>day", "<b>bold"))
-    text = Page(html).text
+    page = render_report(evaluation_of(world), provenance=provenance)
+    assert not any(tag in page for tag in ("<script", "<i>day", "<b>bold"))
+    text = visible_text(page)
     assert all(name in text for name in world.truth)
     assert f"why {evil}" in text and "6 inliers, 12 needed" in text
     assert "Stages: 1 of 2 are on" in text
     assert text.index("ASLFeat") < text.index("poses refined by ICP") < text.index("Recall")
-    assert "<no> depth" in text and "<no>" not in html
-    assert "steps" not in html.partition("<pre>")[2]  # not once more at the end
+    assert "<no> depth" in text and "<no>" not in page
+    assert "steps" not in page.partition("<pre>")[2]  # not once more at the end
 
 
 def test_files(world: Any, tmp_path: Path) -> None:
@@ -63,7 +77,7 @@ def test_files(world: Any, tmp_path: Path) -> None:
     options = {"map_poses": world.mapped, "provenance": {"preset": "classic"}}
     paths = write_report(tmp_path / "evaluation", evaluation, **options)
 
-    assert Page(paths["report.html"].read_text()).references
+    assert "Recall" in visible_text(paths["report.html"].read_text())
     with pytest.raises(OutputError, match="recall"):
         write_report(paths["recall.txt"], evaluation)
     assert sorted(path.name for path in (tmp_path / "evaluation").iterdir()) == sorted(paths)
@@ -182,13 +196,9 @@ Note: too few queries (5) to compare recall: the intervals are wide.
 """
 
 
-def moved(metres: float) -> RigidTransform:
-    return RigidTransform((1.0, 0.0, 0.0, 0.0), (metres, 0.0, 0.0))
-
-
 def test_text_of_a_recall_table() -> None:
     truth = dict.fromkeys(["d1", "d2", "d3", "n1", "n2"], HERE)
-    estimated = {"d1": moved(0.001), "d2": moved(0.1), "d3": moved(2.0), "n1": moved(0.4)}
+    estimated = {"d1": shifted(0.001), "d2": shifted(0.1), "d3": shifted(2.0), "n1": shifted(0.4)}
     conditions = {name: {"d": "day", "n": "night"}[name[0]] for name in truth}
     text = report_text(evaluate_poses(estimated, truth, conditions=conditions, label="aachen"))
     assert text == TABLE

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import rigid
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture.format import KaptureData, Sensor
@@ -85,8 +85,7 @@ CAMERA = Camera("PINHOLE", 640, 480, (500.1, 501.2, 320.3, 240.4))
 
 def turn(angle: float, *translation: float) -> RigidTransform:
     """Rotation about y."""
-    rotation = Rotation.from_euler("y", angle).as_matrix()
-    return RigidTransform.from_matrix(rotation, np.array(translation, float))
+    return rigid([0.0, angle, 0.0], translation)
 
 
 @pytest.fixture

@@ -20,8 +20,6 @@ from megloc_kapture.io.weights import (
     SOURCE_KEY,
     MissingWeightsError,
     add_weights,
-    by_file_name,
-    by_sha256,
     convert_weights,
     describe,
     fetch,
@@ -297,11 +295,3 @@ def test_lookup_suggests_a_similar_name() -> None:
     message = "no weights 'xfeet' in .*; did you mean 'xfeat'\\? there are"
     with pytest.raises(OptionError, match=message):
         lookup("xfeet")
-
-
-def test_files_are_recognised_by_name_and_sha256() -> None:
-    weights, _ = by_file_name("superpoint_lightglue_v0-1_arxiv.pth") or (None, None)
-    assert weights is not None and weights.name == "superpoint_lightglue"
-    _, file = by_file_name("alex.pth") or (None, None)
-    assert file is not None and file.name == "v0.1/alex.pth"
-    assert by_file_name("nothing.pth") is None and by_sha256(64 * "0") is None
