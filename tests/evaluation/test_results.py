@@ -258,3 +258,19 @@ def test_alignment() -> None:
     assert not evaluate(by_chance, true).alignment
     assert evaluate(by_chance, true, align="sim3").row().recall[0].num_within < 5
     assert not evaluate(true, true).alignment
+
+
+def test_another_convention_of_results_or_truth_is_named() -> None:
+    turns = Rotation.random(6, random_state=1)
+    centers = np.random.default_rng(1).normal(size=(6, 3))
+    true, given = dict[str, RigidTransform](), dict[str, RigidTransform]()
+    for n, (turn, center) in enumerate(zip(turns, centers, strict=True)):
+        x, y, z, w = turn.as_quat().tolist()
+        shift = tuple((-turn.apply(center)).tolist())
+        true[f"{n}.jpg"] = RigidTransform((w, x, y, z), shift)
+        given[f"{n}.jpg"] = RigidTransform((x, y, z, w), shift)
+    inverted = {name: pose.inverse() for name, pose in true.items()}
+    note = "0% of the poses fit the truth, but 100% with the results in another convention: poses "
+    assert evaluate(inverted, true).alignment.startswith(f"{note}inverted (camera-to-world")
+    assert "the results in another convention: quaternions" in evaluate(given, true).alignment
+    assert "true poses in another convention: quaternions" in evaluate(true, given).alignment
