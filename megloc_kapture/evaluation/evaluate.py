@@ -134,6 +134,7 @@ def evaluate_results(
         true_poses: Poses = result_in_memory(truth).poses
     else:
         true_poses = read_poses(Path(truth))
+        require(true_poses, "has no poses, as true poses should", path=truth)
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
     relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)

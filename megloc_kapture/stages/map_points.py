@@ -63,6 +63,7 @@ def triangulate_map(
     data = mapping.read()
     images = sorted(data.poses())
     require(images, "no mapping image has a pose", path=mapping.root)
+    require(len(images) > 1, "points need two or more images with poses", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
     of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -238,6 +239,19 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
     write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
     with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
+
+
+def test_folders_without_usable_poses_are_refused(
+    result: Path, truth: Path, tmp_path: Path
+) -> None:
+    table = truth / "sensors" / "trajectories.txt"
+    table.write_text(re.sub(r"(?m)^ *(\d+),", r"1000\1,", table.read_text()))
+    for given in ((result, truth), (truth, result)):
+        with pytest.raises(DataError, match="sensors: no pose of trajectories.txt has the timest"):
+            evaluate(*given)
+    table.unlink()
+    with pytest.raises(DataError, match="query_gt: has no poses"):
+        evaluate(result, truth)
 
 
 def test_alignment() -> None:

@@ -153,3 +153,7 @@ def test_pairs_read_back_in_their_order_without_repetitions(tmp_path: Path) -> N
     pairs = [ImagePair("q 2", "m/1", 1 / 3), ImagePair("q1", "m2", -1.0), ImagePair("m2", "q1", 2)]
     write_pairs(tmp_path / "pairs.txt", [*pairs, ImagePair("q1", "m2", 5.0)])
     assert read_pairs(tmp_path / "pairs.txt") == pairs
+    for text in ("q1 m2\nq1 m1\n", "q1, m2\nq1, m1\n"):  # hloc's, and without a score
+        (tmp_path / "pairs.txt").write_text(text)
+        best_first = [ImagePair("q1", "m2", 0.0), ImagePair("q1", "m1", -1.0)]
+        assert read_pairs(tmp_path / "pairs.txt") == best_first
