@@ -241,8 +241,8 @@ def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> Rigid
         qw, qx, qy, qz, tx, ty, tz = numbers
         require(
             abs(math.hypot(*numbers[3:]) - 1) > 0.01 or abs(math.hypot(*numbers[:4]) - 1) < 0.01,
-            f"{whose}: the quaternion is last, as in trajectories (TUM, EuRoC), whose poses are "
-            f"world_from_cam; a pose file has rows {COLUMNS}, cam_from_world",
+            f"{whose}: the quaternion is last, as in trajectories (TUM, EuRoC) of world_from_cam; "
+            "a pose file has it first, w x y z, and cam_from_world",
         )
     return checked_pose((qw, qx, qy, qz), (tx, ty, tz), whose)
 

@@ -118,6 +118,8 @@ def test_unusable_files_and_folders_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DataError, match=message):
             Photographs(paths)
+    with pytest.raises(OptionError, match="no photographs are given"):
+        Photographs([])
 
 
 def test_a_list_has_the_camera_of_each_image(tmp_path: Path) -> None:
