@@ -202,6 +202,8 @@ def read_result(
 def read_poses(source: Path) -> dict[str, RigidTransform]:
     """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file."""
     require(source.exists(), "no such file or folder", path=source)
+    if source.name == "images.bin":
+        source = source.parent
     if (model := model_of(source)) is not None:
         if (model / "images.txt").is_file():
             return pose_files.read_pose_file(model / "images.txt")

@@ -208,7 +208,7 @@ def test_localization_results_have_reasons_and_inliers(world: Any) -> None:
     assert actual.label == "mine"
 
 
-@pytest.mark.parametrize("kind", ["binary without points", "images.txt"])
+@pytest.mark.parametrize("kind", ["binary without points", "images.bin", "images.txt"])
 def test_colmap_models_are_truth_and_result(
     world: Any, truth: Path, tmp_path: Path, kind: str
 ) -> None:
@@ -229,7 +229,7 @@ def test_colmap_models_are_truth_and_result(
     else:
         model.write_binary(str(folder))
         (folder / "points3D.bin").unlink()
-        source = tmp_path
+        source = folder / "images.bin" if kind == "images.bin" else tmp_path
     for row in (evaluate(source, truth).row(), evaluate(truth, source).row()):
         assert row.num_localized == row.num_queries == len(world.truth)
         assert row.median_position_m == pytest.approx(0.0, abs=1e-9)

@@ -206,6 +206,14 @@ def test_a_compressed_tar_is_refused(tmp_path: Path) -> None:
         TarBlobs(path, ".kpt")
 
 
+def test_a_depth_map_in_millimetres_is_named(tmp_path: Path) -> None:
+    np.array([[0, 1523, 8000.0]], "<f4").tofile(tmp_path / "d.depth")
+    with pytest.raises(DataError, match="d.depth: all values are whole .* millimetres; give met"):
+        read_depth_map(tmp_path / "d.depth", width=3, height=1)
+    np.array([[0, 1.5, 8000.0]], "<f4").tofile(tmp_path / "d.depth")
+    assert read_depth_map(tmp_path / "d.depth", width=3, height=1).max() == 8000
+
+
 def test_a_depth_map_of_another_size_or_a_missing_one_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.depth").write_bytes(bytes(24))
     for width, height in ((3, 3), (3, 1)):

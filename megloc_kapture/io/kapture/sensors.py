@@ -55,7 +55,8 @@ def read_kapture_data(root: Path) -> KaptureData:
             f"no kapture folder, but {inner} in it: give one of them"
             if inner
             else "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
-            "--images` localizes them, `megloc map` makes a map of them",
+            "--images` localizes them, `megloc map` makes a map of them. Poses? `megloc evaluate` "
+            "takes pose files and COLMAP models",
             path=root,
         )
     paths = {
