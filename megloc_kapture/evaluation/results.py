@@ -243,6 +243,10 @@ def result_in_memory(
         if isinstance(pose, RigidTransform):
             poses[image] = pose_files.checked_pose(pose.quat_wxyz, pose.translation, repr(image))
             continue
+        require(
+            isinstance(pose, Pose | Failure),
+            f"{image!r}: a {type(pose).__name__} is no pose; use RigidTransform.from_matrix(R, t)",
+        )
         statuses[image] = pose
         if isinstance(pose, Pose):
             poses[image] = pose.cam_from_world

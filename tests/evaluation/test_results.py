@@ -239,6 +239,8 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
     write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
     with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
+    with pytest.raises(DataError, match=r"'a.jpg': a ndarray is no pose; use RigidTransform"):
+        evaluate({"a.jpg": np.eye(4)}, truth)  # type: ignore[dict-item]
 
 
 def test_folders_without_usable_poses_are_refused(
