@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -99,7 +99,13 @@ class Localize(Reading, Deciding, Common):
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
         if given is not None:
-            _check_candidates(given, queries.names, kapture_map.images, self.pairs)
+            names, images = set(queries.names), set(kapture_map.images)
+            require(
+                any(name in names and not images.isdisjoint(c) for name, c in given.items()),
+                "no row has a query and an image of the map, with their names in the kapture "
+                f"folders, as in: {min(names)}, {min(images)}, 1.0",
+                path=self.pairs,
+            )
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
             named = list(results.items())
@@ -137,22 +143,6 @@ class Localize(Reading, Deciding, Common):
         )
         for path in self.images:
             check_option(not is_kapture(path), f"--images {path}: a kapture folder; use --query")
-
-
-def _check_candidates(
-    given: Mapping[str, Sequence[str]],
-    queries: Sequence[str],
-    images: Sequence[str],
-    path: Path | None,
-) -> None:
-    candidates = {name for names in given.values() for name in names}
-    for kind, names, known in (("query", given, queries), ("map image", candidates, images)):
-        require(
-            not set(known).isdisjoint(names),
-            f"no {kind} is in these pairs, for example {known[0]}; each row is a query, a map "
-            "image and a score, with the names in the kapture folders",
-            path=path,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
