@@ -112,8 +112,10 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
     cameras = ", ".join(f"{count} {model}" for model, count in sorted(models.items()))
     line(console, "kapture", str(folder.root))
     line(console, "sensors", f"{len(data.sensors)}, rigs {len(data.rigs)}")
-    images = len(data.image_names())
-    line(console, "images", f"{images} ({cameras}), {len(data.poses())} with a pose")
+    images = data.image_names()
+    line(console, "images", f"{len(images)} ({cameras}), {len(data.poses())} with a pose")
+    if missing := [image for image in images if not folder.image_path(image).is_file()]:
+        line(console, "missing files", f"{len(missing)} of the images, such as {missing[0]}")
     if data.records_depth:
         joined = len(depth_records(data))
         # a depth map belongs to an image if a rig links their sensors

@@ -98,6 +98,14 @@ class Localize(Reading, Deciding, Common):
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
+        if given is not None:
+            names, images = set(queries.names), set(kapture_map.images)
+            require(
+                any(name in names and not images.isdisjoint(c) for name, c in given.items()),
+                "no row has a query and an image of the map, with their names in the kapture "
+                f"folders, as in: {min(names)}, {min(images)}, 1.0",
+                path=self.pairs,
+            )
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
             named = list(results.items())

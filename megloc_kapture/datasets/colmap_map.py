@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import cameras_of_images, is_kapture, warn_of_scaled
@@ -75,13 +75,16 @@ def find_colmap(
     ``database.db`` may also lie in or next to the model's folder. The arguments ``images`` and
     ``database`` replace the search.
     """
+    require(path.is_dir(), "no such folder; give the folder of a COLMAP model", path=path)
     models = _models(path)
-    require(
-        models,
-        f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here, in sparse/ "
-        "or in sparse/0",
-        path=path,
-    )
+    if not models:
+        deeper = sorted([*path.rglob(BINARY_FILES[1]), *path.rglob(TEXT_FILES[1])])
+        other = f"; there is one in {deeper[0].parent}" if deeper else ""
+        raise DataError(
+            f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here, in sparse/ "
+            f"or in sparse/0{other}",
+            path=path,
+        )
     if len(models) > 1:
         choices = ", ".join(str(model.relative_to(path)) for model in models)
         raise DataError(f"there are several models, give one of them: {choices}", path=path)
@@ -140,6 +143,10 @@ class ColmapReconstruction:
                     f"{len(missing)} of the model's {len(names)} images are not here, the first "
                     f"is {missing[0]}"
                 )
+                # often in a subfolder, or converted to another format
+                alike = next(source.images.rglob(f"{PurePosixPath(missing[0]).stem}.*"), None)
+                if alike is not None:
+                    message += f" (but {alike.relative_to(source.images)} is)"
                 if source.database is None:
                     raise DataError(
                         f"{message}; give their folder with `megloc import colmap --images`",

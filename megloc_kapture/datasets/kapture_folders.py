@@ -150,7 +150,7 @@ def _tables_beside(mapping: KaptureFolder) -> Path:
 
 def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
     poses = mapping.read().poses()
-    require(poses, "no mapping image has a pose", path=mapping.root)
+    require(poses, "no mapping image has a pose (sensors/trajectories.txt)", path=mapping.root)
     return poses
 
 

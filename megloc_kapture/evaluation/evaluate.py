@@ -12,7 +12,7 @@ import numpy as np
 
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.comparison import WithoutTruth, evaluate_without_truth
-from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.metrics import Threshold, pose_errors
 from megloc_kapture.evaluation.pose_files import poses_by_image
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
 from megloc_kapture.evaluation.results import (
@@ -28,7 +28,13 @@ from megloc_kapture.evaluation.results import (
     side_tables_near,
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
-from megloc_kapture.geometry.poses import align_poses, stack_poses
+from megloc_kapture.geometry.poses import (
+    CONVENTIONS,
+    align_poses,
+    better_conventions,
+    camera_centers,
+    stack_poses,
+)
 from megloc_kapture.io.dataset_tables import (
     METRES,
     SimilarityTransform,
@@ -47,6 +53,9 @@ Align = Literal["none", "se3", "sim3"]
 _MIN_AGREEING = 4
 # largest number of poses for the note that an alignment would fit
 _MOST_COMPARED = 500
+# a pose fits the truth in a convention if its errors are at most these: position as a share of the
+# extent of the true camera centres, and degrees
+_NEAR_SHARE, _NEAR_DEG = 0.1, 10.0
 
 Localized = Path | str | Mapping[str, Pose | Failure] | Mapping[str, RigidTransform]
 
@@ -125,6 +134,7 @@ def evaluate_results(
         true_poses: Poses = result_in_memory(truth).poses
     else:
         true_poses = read_poses(Path(truth))
+        require(true_poses, "has no poses, as true poses should", path=truth)
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
     relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)
@@ -271,6 +281,8 @@ def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, s
     images = sorted(result.poses.keys() & true_poses.keys())
     if align == "none":  # a sample is enough for a note; time grows with the square of its size
         images = images[:: -(-len(images) // _MOST_COMPARED) or 1]
+        if note := _convention_note(result.poses, true_poses, images):
+            return result, note
     estimated = stack_poses(result.poses[image] for image in images)
     true = stack_poses(true_poses[image] for image in images)
     try:
@@ -297,6 +309,27 @@ def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, s
     moved = {image: world.pose_in_official(pose) for image, pose in result.poses.items()}
     note = f"aligned with the truth by {kind}, with which {number} of {len(images)} poses agree"
     return replace(result, poses=moved), note
+
+
+def _convention_note(estimated: Poses, true: Poses, images: Sequence[str]) -> str:
+    """Name the pose conventions in which the results, or the true poses, would fit, if any."""
+    if len(images) < _MIN_AGREEING:
+        return ""
+    extent_m = np.ptp(camera_centers(*stack_poses(true[image] for image in images)), axis=0).max()
+    sides = {"results": (estimated, true), "true poses": (true, estimated)}
+    for whose, (poses, others) in sides.items():
+        shares = []
+        for read in (lambda pose: pose, *CONVENTIONS.values()):
+            errors = pose_errors({image: read(poses[image]) for image in images}, others, images)
+            near = errors.position_m <= _NEAR_SHARE * extent_m
+            shares.append(float((near & (errors.angle_deg <= _NEAR_DEG)).mean()))
+        if better := better_conventions(shares):
+            return (
+                f"{shares[0]:.0%} of the poses fit the truth, but {max(shares):.0%} with the "
+                f"{whose} in another convention: {' or '.join(better)}. Convert them to "
+                "cam_from_world with x right, y down, z forward"
+            )
+    return ""
 
 
 def _labels(results: Sequence[Localized]) -> list[str]:

@@ -28,6 +28,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError, require
+from megloc_kapture.io.colmap_model import image_rows
 from megloc_kapture.io.dataset_tables import (
     MAX_QUATERNION_NORM_ERROR,
     PoseFileFormat,
@@ -103,13 +104,16 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     """Read name -> ``cam_from_world`` from a pose file or COLMAP's ``images.txt``, in file order.
 
     Rows with a number that is not finite or with a zero quaternion, which other tools write for
-    failed queries, are left out with a warning. Tabs, CRLF, empty lines and comments are accepted.
+    failed queries, are left out with a warning. Tabs, commas, CRLF, backslashes in names, empty
+    lines, comments and a header that names the columns are accepted.
     """
     text = read_text(path)
-    rows = (_colmap_rows if is_colmap_images(text) else _rows)(text)
+    rows = _in_column_order(_rows(text))
+    if is_colmap_images(text):
+        rows = ((number, [*fields[9:], *fields[1:8]]) for number, fields, _ in image_rows(text))
     poses: dict[str, RigidTransform | None] = {}
     for number, fields in rows:
-        name = fields[0]
+        name = fields[0].replace("\\", "/")
         with named(path, number):
             require(len(fields) == 8, f"{len(fields)} columns instead of 8 ({COLUMNS})")
             require(name not in poses, f"{name!r} is given twice")
@@ -130,17 +134,29 @@ def is_colmap_images(text: str) -> bool:
 
 def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
     for number, line in enumerate(text.split("\n"), start=1):
-        if (fields := line.split()) and not fields[0].startswith("#"):
+        if (fields := _fields(line)) and not fields[0].startswith("#"):
             yield number, fields
 
 
-def _colmap_rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    lines = iter(enumerate(text.split("\n"), start=1))
-    for number, line in lines:
-        if (fields := line.split(maxsplit=9)) and not fields[0].startswith("#"):
-            next(lines, None)  # the image's keypoints
-            name = fields.pop().strip() if len(fields) == 10 else ""
-            yield number, [name, *fields[1:8]]
+def _fields(line: str) -> list[str]:
+    """Split a row at blanks, or at commas or semicolons, as spreadsheets write it."""
+    for separator in ",;":
+        fields = [field.strip() for field in line.split(separator)]
+        if len(fields) >= 8 and not any(" " in field for field in fields[1:]):
+            return fields
+    return line.split()
+
+
+def _in_column_order(rows: Iterable[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    """Choose the columns that a header names, as in ``poses.csv``; without one, keep all."""
+    header: list[str] = []
+    for number, fields in rows:
+        if set(COLUMNS.split()[1:]) <= set(fields):
+            header = fields
+        elif len(fields) == len(header):
+            yield number, [fields[0], *(fields[header.index(c)] for c in COLUMNS.split()[1:])]
+        else:
+            yield number, fields
 
 
 def poses_by_image(
@@ -223,6 +239,11 @@ def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> Rigid
         tx, ty, tz, qx, qy, qz, qw = numbers
     else:
         qw, qx, qy, qz, tx, ty, tz = numbers
+        require(
+            abs(math.hypot(*numbers[3:]) - 1) > 0.01 or abs(math.hypot(*numbers[:4]) - 1) < 0.01,
+            f"{whose}: the quaternion is last, as in trajectories (TUM, EuRoC) of world_from_cam; "
+            "a pose file has it first, w x y z, and cam_from_world",
+        )
     return checked_pose((qw, qx, qy, qz), (tx, ty, tz), whose)
 
 

@@ -27,7 +27,7 @@ from megloc_kapture.io.dataset_tables import (
     read_world,
     unit_of,
 )
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.values import (
     Camera,
@@ -188,7 +188,7 @@ def read_result(
         data = KaptureFolder(path).read()
         return Result(
             label,
-            _in_frame_of(benchmark.world, data.poses(), path),
+            _in_frame_of(benchmark.world, _poses_of(data, path), path),
             tuple(sorted(data.image_names())),
             _if_there(tables.read_status, path / tables.STATUS_FILE) or {},
             covariances=_if_there(tables.read_covariances, path / tables.COVARIANCE_FILE) or {},
@@ -202,16 +202,27 @@ def read_result(
 def read_poses(source: Path) -> dict[str, RigidTransform]:
     """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file."""
     require(source.exists(), "no such file or folder", path=source)
+    if source.name == "images.bin":
+        source = source.parent
     if (model := model_of(source)) is not None:
         if (model / "images.txt").is_file():
             return pose_files.read_pose_file(model / "images.txt")
         images = read_colmap_model(model, with_points=False).images
         return {image.name: image.cam_from_world for image in images}
-    return (
-        KaptureFolder(source).read().poses()
-        if source.is_dir()
-        else pose_files.read_pose_file(source)
+    if source.is_dir():
+        return _poses_of(KaptureFolder(source).read(), source)
+    return pose_files.read_pose_file(source)
+
+
+def _poses_of(data: KaptureData, folder: Path) -> dict[str, RigidTransform]:
+    poses = data.poses()
+    require(
+        poses or not data.trajectories,
+        "no pose of trajectories.txt has the timestamp and sensor of an image in "
+        "records_camera.txt",
+        path=folder / "sensors",
     )
+    return poses
 
 
 def model_of(folder: Path) -> Path | None:
@@ -232,6 +243,10 @@ def result_in_memory(
         if isinstance(pose, RigidTransform):
             poses[image] = pose_files.checked_pose(pose.quat_wxyz, pose.translation, repr(image))
             continue
+        require(
+            isinstance(pose, Pose | Failure),
+            f"{image!r}: a {type(pose).__name__} is no pose; use RigidTransform.from_matrix(R, t)",
+        )
         statuses[image] = pose
         if isinstance(pose, Pose):
             poses[image] = pose.cam_from_world

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 _CHI2_95 = 12.592  # quantile of six degrees of freedom
 
+NO_POSE = "no pose in the result"
 Outcome = Literal["localized", "fallback", "missing"]
 # column of a table of queries -> attribute
 _COLUMNS = {
@@ -298,7 +299,7 @@ def query_result(
     status = result.statuses.get(image)
     if status is None:
         outcome: Outcome = "missing" if pose is None else "localized"
-        reason = "no pose in the result" if pose is None else ""
+        reason = NO_POSE if pose is None else ""
         status = LocalizationResult(confidence=result.confidences.get(image))
     elif pose is not None and status.fallback == "none":
         outcome, reason = "localized", ""

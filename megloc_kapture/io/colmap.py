@@ -370,13 +370,15 @@ def write_model(
     """Write a binary COLMAP model in which every camera is its own rig; ids count from 1.
 
     ``observed`` holds, for each image, the rows of its keypoints and of the points they observe.
-    Unobserved points are written too.
+    Unobserved points are written too. Of several points that a keypoint observes, which kapture
+    permits, only the first is kept for it.
     """
     pycolmap = load_pycolmap()
     model = _posed_reconstruction(images, *_cameras_of(images))
     tracks: list[list[Any]] = [[] for _ in xyz]
     for number, (rows, points) in enumerate(observed, start=1):
-        for row, point in zip(rows.tolist(), points.tolist(), strict=True):
+        rows, first = np.unique(rows, return_index=True)
+        for row, point in zip(rows.tolist(), points[first].tolist(), strict=True):
             tracks[point].append(pycolmap.TrackElement(number, row))
     rgb = np.clip(np.rint(colours), 0, 255).astype(np.uint8)
     for point, elements, colour in zip(xyz, tracks, rgb, strict=True):

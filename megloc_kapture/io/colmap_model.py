@@ -5,8 +5,9 @@ from __future__ import annotations
 import mmap
 import struct
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,15 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import load_pycolmap, quiet_stderr
-from megloc_kapture.io.files import TEMPORARY, check_relative, named, reading
+from megloc_kapture.io.files import TEMPORARY, check_relative, named, read_text, reading
+from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.io.text_lines import numbers_of, read_camera_rows
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+IMAGE_COLUMNS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _RIG_FILES = ("rigs", "frames")  # since COLMAP 3.12
 # models that kapture lacks: an equivalent with distortion, and the number of zeros to append
 _SAME_AS = {"SIMPLE_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", 1), "FISHEYE": ("OPENCV_FISHEYE", 4)}
@@ -122,29 +126,38 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     """Read the model of a folder; without points, their file need not exist."""
     paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
-        require(path.is_file(), "file is missing", path=path)
+        remedy = "; make an empty one for a model of poses only" if path.stem == "points3D" else ""
+        require(path.is_file(), f"file is missing{remedy}", path=path)
         if path.name in _RECORDS:
             _check_complete(path)
+    names: dict[int, str] = {}
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as links:
         for path in paths:
             link = Path(links) / path.name
             if path.name == TEXT_FILES[1]:
-                # pycolmap drops the last image if its empty line of features is missing
-                link.write_bytes(path.read_bytes() + b"\n\n")
+                text, names = _images_for_pycolmap(path, paths[0])
+                link.write_text(text, encoding="utf-8")
+            elif path.suffix == ".txt":
+                link.write_text(read_text(path), encoding="utf-8")  # without a byte order mark
             else:
                 link.symlink_to(path.resolve())
         if not with_points:
             no_points = bytes(8) if paths[0].suffix == ".bin" else b""
             (Path(links) / f"points3D{paths[0].suffix}").write_bytes(no_points)
-        names = ", ".join(path.name for path in paths)
-        with reading(folder, f"a model that COLMAP can read ({names})"), quiet_stderr():
-            model = load_pycolmap().Reconstruction(links)
+        files = ", ".join(path.name for path in paths)
+        with reading(folder, f"a model that COLMAP can read ({files})"), quiet_stderr():
+            try:
+                model = load_pycolmap().Reconstruction(links)
+            except Exception:
+                if names:
+                    read_camera_rows(paths[0])  # names the line of a wrong camera
+                raise
     cameras = {camera_id: _camera(camera, paths[0]) for camera_id, camera in model.cameras.items()}
     if paths[0].suffix == ".bin":
         size = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
         if paths[0].stat().st_size != size:
             raise _incomplete(paths[0])
-    images = _images(model, paths[1])
+    images = _images(model, paths[1], names)
     return ColmapModel(
         cameras,
         images,
@@ -152,6 +165,47 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
         {rig_id: _cams_from_rig(rig) for rig_id, rig in sorted(model.rigs.items())},
         {image_id: image.frame_id for image_id, image in model.images.items()},
     )
+
+
+def image_rows(text: str) -> Iterator[tuple[int, list[str], str]]:
+    """Yield line number, :data:`IMAGE_COLUMNS` and features of each image of ``images.txt``.
+
+    Names may have blanks. Tools that write only poses often omit the empty line of features.
+    """
+    lines = enumerate([*map(str.strip, text.split("\n")), ""], start=1)
+    is_features = False
+    for (number, line), (_, following) in pairwise(lines):
+        if is_features or not line or line.startswith("#"):
+            is_features = False
+            continue
+        is_features = not _is_image(following)
+        yield number, line.split(maxsplit=9), following if is_features else ""
+
+
+def _is_image(line: str) -> bool:
+    """Return whether a line is an image's, not its features, triples of numbers."""
+    fields = line.split()
+    return len(fields) >= 10 and (len(fields) % 3 != 0 or not FLOAT_PATTERN.fullmatch(fields[-1]))
+
+
+def _images_for_pycolmap(path: Path, cameras: Path) -> tuple[str, dict[int, str]]:
+    """Check ``images.txt``; return it with ids in place of names, and the names by id.
+
+    pycolmap ends names at a blank, and takes an image for features if the line before is missing.
+    """
+    cameras_text = read_text(cameras).split("\n")
+    camera_ids = {line.split(maxsplit=1)[0] for line in cameras_text if line.strip()}
+    names: dict[int, str] = {}
+    lines: list[str] = []
+    for number, row, features in image_rows(read_text(path)):
+        with named(path, number):
+            require(len(row) == 10, f"{len(row)} columns instead of 10 ({IMAGE_COLUMNS})")
+            image_id = int(numbers_of(row[:9], IMAGE_COLUMNS.removesuffix(" NAME"))[0])
+            require(image_id not in names, f"image id {image_id} is listed twice")
+            require(row[8] in camera_ids, f"camera {row[8]} is not in {cameras.name}")
+        names[image_id] = row[9].replace("\\", "/")
+        lines.append(f"{' '.join(row[:9])} {image_id}\n{features}\n")
+    return "".join(lines), names
 
 
 def _check_complete(path: Path) -> None:
@@ -192,13 +246,14 @@ def _camera(camera: Any, path: Path) -> Camera:
         return Camera(model, camera.width, camera.height, params)
 
 
-def _images(model: Any, path: Path) -> tuple[ColmapImage, ...]:
+def _images(model: Any, path: Path, names: Mapping[int, str]) -> tuple[ColmapImage, ...]:
     images: dict[str, ColmapImage] = {}
     for image_id, image in sorted(model.images.items()):
         if not image.has_pose:
             continue
-        with named(path, about=f"image {image.name!r}"):
-            name = check_relative(image.name.removeprefix("./"))
+        given = names.get(image_id, image.name)
+        with named(path, about=f"image {given!r}"):
+            name = check_relative(given.removeprefix("./"))
             require(name not in images, "is listed twice")
             pose = _transform(image.cam_from_world())
         images[name] = ColmapImage(image_id, name, image.camera_id, pose)

@@ -100,10 +100,11 @@ def check_relative(text: str) -> str:
     """Return ``text`` if it is a plain relative path (``a/b.jpg``); raise DataError if not."""
     require(text, "empty path")
     if "\\" in text or has_control_characters(text):
-        raise DataError(f"backslash or control character in path {text!r}")
+        raise DataError(f"backslash or control character in path {text!r}; separate folders by /")
     components = text.split("/")
     if text.startswith("/") or ".." in components:
-        raise DataError(f"path {text!r} leads out of its folder: it begins with '/' or has '..'")
+        reason = "it begins with '/' or has '..'; names are relative to the folder of the images"
+        raise DataError(f"path {text!r} leads out of its folder: {reason}")
     if "" in components or "." in components:
         raise DataError(f"path {text!r} has an empty or '.' component")
     return text

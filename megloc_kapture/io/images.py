@@ -50,6 +50,8 @@ _LOSSLESS = (".pgm", ".pnm", ".gif", ".jp2")
 # images that use more than this fraction of their range are scaled, others are stretched
 _MIN_RANGE = 0.5
 _STRETCHED_PERCENT = (0.1, 99.9)
+# a depth map of whole numbers with larger ones is not in metres
+_MOST_WHOLE_M = 100
 
 
 def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
@@ -207,10 +209,18 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
     expected = 4 * width * height
     require(
         len(content) == expected,
-        f"{len(content)} bytes, but {width}x{height} float32 need {expected}",
+        f"{len(content)} bytes, but {width}x{height} float32 need {expected}; a depth map is raw "
+        "float32 in metres, of the size of its sensor",
         path=path,
     )
-    return np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(height, width)
+    depth_m = np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(height, width)
+    known = depth_m[(depth_m > 0) & np.isfinite(depth_m)]
+    require(
+        not (known > _MOST_WHOLE_M).any() or (np.abs(known - np.rint(known)) > 1e-3).any(),
+        "all values are whole numbers, as of a 16-bit image in millimetres; give metres",
+        path=path,
+    )
+    return depth_m
 
 
 def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:

@@ -139,7 +139,8 @@ def read_camera_rows(path: Path) -> dict[str, Camera]:
                 )
             name = check_relative(row["name"])
             require(name not in cameras, f"{name!r} is listed twice")
-            width, height, *params = fields_of(row["numbers"])
-            cameras[name] = Camera(row["model"], int(width), int(height), tuple(map(float, params)))
+            width, height, *params = map(float, fields_of(row["numbers"]))
+            require((width % 1, height % 1) == (0, 0), "the image size is not in whole pixels")
+            cameras[name] = Camera(row["model"], int(width), int(height), tuple(params))
     require(cameras, "no camera in this list", path=path)
     return cameras

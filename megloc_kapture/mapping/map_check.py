@@ -159,13 +159,14 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
     errors = _median_errors_px(observed, xyz)
     sides = (max(image.camera.width, image.camera.height) for image in observed)
     limits = [max(_MIN_LIMIT_PX, _MAX_SHARE * side) for side in sides]
-    failing = sum(not error <= limit for error, limit in zip(errors, limits, strict=True))
-    if failing <= _MAX_FAILING * len(observed):
+    checked = zip(observed, errors, limits, strict=True)
+    failing = [image.name for image, error, limit in checked if not error <= limit]
+    if len(failing) <= _MAX_FAILING * len(observed):
         return None
     message = (
-        f"the points do not fit the keypoints: {failing} of {len(observed)} images have a median "
-        f"reprojection error above {min(limits):.3g} px; the median over all images is "
-        f"{float(np.median(errors)):.3g} px"
+        f"the points do not fit the keypoints: {len(failing)} of {len(observed)} images, such as "
+        f"{failing[0]}, have a median reprojection error above {min(limits):.3g} px; the median "
+        f"over all images is {float(np.median(errors)):.3g} px"
     )
     best, error = _likely_mistake(observed, xyz)
     if error > max(np.median(limits) / 2, 4.0) or error > np.median(errors) / 4:

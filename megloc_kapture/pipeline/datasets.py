@@ -34,6 +34,7 @@ from megloc_kapture.errors import (
     OptionError,
     PluginError,
     check_option,
+    require,
     suggestion,
 )
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
@@ -76,6 +77,7 @@ class DatasetChoice:
     def check(self) -> None:
         """Raise DataError if the folder cannot hold the dataset."""
         if self.root is not None:
+            require(self.root.exists(), "no such folder", path=self.root)
             (check_root if self.adapter is None else self.adapter.check)(self.root)
 
     def has_truth(self) -> bool:

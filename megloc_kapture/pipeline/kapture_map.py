@@ -134,8 +134,14 @@ class KaptureMap:
             f"pixel_origin is {pixel_origin!r}; give auto, corner or centre",
         )
         folder = KaptureFolder(path, features_dirs=features_dirs)
-        folder.read()
+        data = folder.read()
         check_points(folder, "localize in")
+        require(
+            data.poses(),
+            "no image of the map has a pose: sensors/trajectories.txt is missing, or has other "
+            "timestamps or sensors than records_camera.txt",
+            path=folder.root,
+        )
         indices = _read_indices(folder, keypoints_types)
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":

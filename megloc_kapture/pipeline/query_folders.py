@@ -20,7 +20,7 @@ from megloc_kapture.datasets.kapture_folders import (
     warn_of_scaled,
     with_cameras_of_images,
 )
-from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.files import (
     TEMPORARY,
     check_relative,
@@ -334,6 +334,7 @@ class Photographs(Queries):
         super().__init__()
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be used; give 1 or more")
+        check_option(paths, "no photographs are given; name image files or folders")
         roots = [Path(path) for path in paths]
         files = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent

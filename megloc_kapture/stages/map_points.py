@@ -62,7 +62,8 @@ def triangulate_map(
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
     images = sorted(data.poses())
-    require(images, "no mapping image has a pose", path=mapping.root)
+    require(images, "no mapping image has a pose (sensors/trajectories.txt)", path=mapping.root)
+    require(len(images) > 1, "points need two or more images with poses", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
     of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:

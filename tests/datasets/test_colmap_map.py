@@ -238,6 +238,8 @@ def test_ambiguous_and_missing_models_are_refused(room: Path) -> None:
     for path, given, message in (
         (room, {}, "several models, give one of them: sparse/0, sparse/1"),
         (room / "images", {}, "images: no COLMAP model: neither images.bin nor"),
+        (room.parent, {}, "no COLMAP model: .*; there is one in .*room/sparse/0"),
+        (room / "none", {}, "none: no such folder; give the folder of a COLMAP model"),
         (model, {"images": room / "none"}, "none: no such folder of images"),
         (model, {"database": room / "images"}, "images: no such database"),
     ):
@@ -249,8 +251,8 @@ def test_without_features_or_images_the_import_is_refused(room: Path, tmp_path: 
     source, output = replace(find_colmap(room), database=None), tmp_path / "map"
     with pytest.raises(DataError, match="no descriptors .*--database.* or images .*--images"):
         import_colmap(ColmapFolders(source.model, None, None), output)
-    (room / "images" / "0003.jpg").unlink()
-    message = "images: 1 of the model's 7 images are not here, .* 0003"
+    (room / "images" / "0003.jpg").rename(room / "images" / "0003.png")
+    message = r"images: 1 of the model's 7 images are not here, .* 0003.jpg \(but 0003.png is\)"
     with pytest.raises(DataError, match=message):
         import_colmap(source, output)
     assert list(output.iterdir()) == []

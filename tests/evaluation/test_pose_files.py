@@ -87,8 +87,13 @@ def test_invalid_poses_are_not_written(
         "\ufeffa.jpg 1 0 0 0 1.5 -0.2 3\n",
         "\n\na.jpg 1.0009 0 0 0 1.5 -.2 +3",
         "# name qw qx qy qz tx ty tz\na.jpg 1 0 0 0 1.5 -0.2 3\n",
+        "a.jpg, 1, 0, 0, 0, 1.5, -0.2, 3\n",
+        "a.jpg;1;0;0;0;1.5;-0.2;3",
+        "image,qw,qx,qy,qz,tx,ty,tz,center_x\na.jpg,1,0,0,0,1.5,-0.2,3,-1.5\n",
+        "image tx ty tz qx qy qz qw\na.jpg 1.5 -0.2 3 0 0 0 1\n",
         "7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n1.5 2.5 -1 3.5 4.5 17\n",
         "# IMAGE_ID, QW, ...\n7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n\n8 nan 0 0 0 0 0 0 4 b c.jpg\n",
+        "7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n8 nan 0 0 0 0 0 0 4 b.jpg\n",
     ],
 )
 def test_variants_of_other_tools_are_read(tmp_path: Path, text: str) -> None:
@@ -108,7 +113,8 @@ def test_rows_without_a_pose_are_misses(tmp_path: Path, caplog: pytest.LogCaptur
     ("read", "good", "line", "words"),
     [
         (read_pose_file, GOOD, "b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
-        (read_pose_file, GOOD, "b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "is not a number"),
+        (read_pose_file, GOOD, "b.jpg 1,0 0,0 0,0 0,0 1,5 -0,2 3,0", "'1,0' is not a number"),
+        (read_pose_file, GOOD, "1.5 1 2 3 0 0 0 1", "'1.5': the quaternion is last, as in traj"),
         (read_pose_file, GOOD, "b.jpg 1.0011 0 0 0 1 -0.2 3", "length 1.0011"),
         (read_pose_file, GOOD, "a.jpg 1 0 0 0 1 -0.2 3", "given twice"),
         (read_mlad_file, GOOD_PAIR, "100 205", "2 columns instead of 9"),

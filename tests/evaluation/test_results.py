@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -207,7 +208,7 @@ def test_localization_results_have_reasons_and_inliers(world: Any) -> None:
     assert actual.label == "mine"
 
 
-@pytest.mark.parametrize("kind", ["binary without points", "images.txt"])
+@pytest.mark.parametrize("kind", ["binary without points", "images.bin", "images.txt"])
 def test_colmap_models_are_truth_and_result(
     world: Any, truth: Path, tmp_path: Path, kind: str
 ) -> None:
@@ -228,7 +229,7 @@ def test_colmap_models_are_truth_and_result(
     else:
         model.write_binary(str(folder))
         (folder / "points3D.bin").unlink()
-        source = tmp_path
+        source = folder / "images.bin" if kind == "images.bin" else tmp_path
     for row in (evaluate(source, truth).row(), evaluate(truth, source).row()):
         assert row.num_localized == row.num_queries == len(world.truth)
         assert row.median_position_m == pytest.approx(0.0, abs=1e-9)
@@ -238,6 +239,21 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
     write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
     with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
+    with pytest.raises(DataError, match=r"'a.jpg': a ndarray is no pose; use RigidTransform"):
+        evaluate({"a.jpg": np.eye(4)}, truth)  # type: ignore[dict-item]
+
+
+def test_folders_without_usable_poses_are_refused(
+    result: Path, truth: Path, tmp_path: Path
+) -> None:
+    table = truth / "sensors" / "trajectories.txt"
+    table.write_text(re.sub(r"(?m)^ *(\d+),", r"1000\1,", table.read_text()))
+    for given in ((result, truth), (truth, result)):
+        with pytest.raises(DataError, match="sensors: no pose of trajectories.txt has the timest"):
+            evaluate(*given)
+    table.unlink()
+    with pytest.raises(DataError, match="query_gt: has no poses"):
+        evaluate(result, truth)
 
 
 def test_alignment() -> None:
@@ -254,3 +270,19 @@ def test_alignment() -> None:
     assert not evaluate(by_chance, true).alignment
     assert evaluate(by_chance, true, align="sim3").row().recall[0].num_within < 5
     assert not evaluate(true, true).alignment
+
+
+def test_another_convention_of_results_or_truth_is_named() -> None:
+    turns = Rotation.random(6, random_state=1)
+    centers = np.random.default_rng(1).normal(size=(6, 3))
+    true, given = dict[str, RigidTransform](), dict[str, RigidTransform]()
+    for n, (turn, center) in enumerate(zip(turns, centers, strict=True)):
+        x, y, z, w = turn.as_quat().tolist()
+        shift = tuple((-turn.apply(center)).tolist())
+        true[f"{n}.jpg"] = RigidTransform((w, x, y, z), shift)
+        given[f"{n}.jpg"] = RigidTransform((x, y, z, w), shift)
+    inverted = {name: pose.inverse() for name, pose in true.items()}
+    note = "0% of the poses fit the truth, but 100% with the results in another convention: poses "
+    assert evaluate(inverted, true).alignment.startswith(f"{note}inverted (camera-to-world")
+    assert "the results in another convention: quaternions" in evaluate(given, true).alignment
+    assert "true poses in another convention: quaternions" in evaluate(true, given).alignment

@@ -190,6 +190,15 @@ def model_of_two_groups(folder: Path, num_shared: int) -> object:
     return load_pycolmap().Reconstruction(str(folder))
 
 
+def test_a_keypoint_with_two_points_keeps_the_first(tmp_path: Path) -> None:
+    points, images, matches = scene(CAMERAS["PINHOLE"], num_images=2, num_points=5)
+    rows = [np.append(matches[0, 1][:, side], matches[0, 1][0, side]) for side in (0, 1)]
+    seen = np.array([0, 1, 2, 3, 4, 4])
+    write_model(tmp_path, images, [(row, seen) for row in rows], points, np.zeros((5, 3)))
+    model = load_pycolmap().Reconstruction(str(tmp_path))
+    assert [len(point.track.elements) for _, point in sorted(model.points3D.items())] == [2] * 5
+
+
 @pytest.mark.parametrize(("num_shared", "parts"), [(30, 1), (29, 2)])
 def test_groups_with_fewer_than_30_common_points_become_two_models(
     tmp_path: Path, num_shared: int, parts: int

@@ -60,6 +60,8 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ("name", "row", "message"),
     [
         ("sensors/records_camera.txt", "1, cam", "expected 3 columns, got 2"),
+        ("sensors/records_camera.txt", "9.5, cam, a.jpg", "timestamp '9.5' is not an integer"),
+        ("sensors/records_camera.txt", "9, cam, d\\a.jpg", "backslash .*; separate folders by /"),
         ("sensors/records_camera.txt", "9, nocam, a.jpg", "unknown sensor or rig 'nocam'"),
         ("sensors/records_camera.txt", "9, deep, a.jpg", "of type 'depth', not 'camera'"),
         ("sensors/records_camera.txt", "0, cam, b.jpg", "timestamp 0 of 'cam' is listed twice"),
@@ -82,7 +84,7 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         ("keypoints.txt", "n, float16, 2", "dtype 'float16' is not one of"),
         ("keypoints.txt", "n, float32, 0", "dsize '0'"),
         ("descriptors.txt", "n, float32, 2, ../k, L2", "leads out"),
-        ("pairs.txt", "a, b", "expected 3 columns, got 2"),
+        ("pairs.txt", "a b c d", "expected 3 columns, got 4"),
         ("pairs.txt", "a, b, c", "expected finite numbers score, got 'c'"),
         ("pairs.txt", "a, ../b, 1", "leads out"),
         ("pairs.txt", ", b, 1", "empty"),
@@ -202,6 +204,14 @@ def test_a_compressed_tar_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"\x1f\x8b\x08packed")
     with pytest.raises(DataError, match=r"keypoints\.tar: not an uncompressed tar"):
         TarBlobs(path, ".kpt")
+
+
+def test_a_depth_map_in_millimetres_is_named(tmp_path: Path) -> None:
+    np.array([[0, 1523, 8000.0]], "<f4").tofile(tmp_path / "d.depth")
+    with pytest.raises(DataError, match="d.depth: all values are whole .* millimetres; give met"):
+        read_depth_map(tmp_path / "d.depth", width=3, height=1)
+    np.array([[0, 1.5, 8000.0]], "<f4").tofile(tmp_path / "d.depth")
+    assert read_depth_map(tmp_path / "d.depth", width=3, height=1).max() == 8000
 
 
 def test_a_depth_map_of_another_size_or_a_missing_one_is_named(tmp_path: Path) -> None:

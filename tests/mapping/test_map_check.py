@@ -102,7 +102,7 @@ MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
     ),
     "random points": (
         with_points(lambda p: np.random.default_rng(1).uniform(-2, 2, p.shape)),
-        "do not fit the keypoints: 9 of 9 images have",
+        "do not fit the keypoints: 9 of 9 images, such as .*, have",
     ),
 }
 

@@ -108,8 +108,10 @@ def test_without_megloc_twins_the_message_has_the_remedy(
 
 def test_an_import_writes_a_summary_and_the_changed_protocol(tmp_path: Path) -> None:
     root = tmp_path / "root"
-    root.mkdir()
     choice = DatasetChoice("toy", root, Toy())
+    with pytest.raises(DataError, match="root: no such folder"):
+        choice.check()
+    root.mkdir()
     with pytest.raises(DataError, match="1.jpg is missing"):
         choice.check()
     (root / "1.jpg").touch()

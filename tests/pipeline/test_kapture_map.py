@@ -138,8 +138,17 @@ def test_unusable_maps_are_refused(workspace: Path, map_copy: Path, tmp_path: Pa
         KaptureMap.open(map_copy, pixel_origin="middle")  # type: ignore[arg-type]
     with pytest.raises(DataError, match="no such kapture folder"):
         KaptureMap.open(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="no kapture folder, but .*mapping.*: give one of them"):
+        KaptureMap.open(workspace)
+    with pytest.raises(DataError, match="points3d.txt: a file; give a kapture folder"):
+        KaptureMap.open(map_copy / "reconstruction" / "points3d.txt")
     with pytest.raises(DataError, match="no map to localize in: .*megloc triangulate"):
         KaptureMap.open(workspace / "mapping")
+    poses = map_copy / "sensors" / "trajectories.txt"
+    poses.rename(poses.with_suffix(".old"))
+    with pytest.raises(DataError, match="no image of the map has a pose: .*trajectories.txt"):
+        KaptureMap.open(map_copy)
+    poses.with_suffix(".old").rename(poses)
     observations = map_copy / "reconstruction" / "observations.txt"
     header = [row for row in observations.read_text().splitlines() if row.startswith("#")]
     observations.write_text("\n".join(header) + "\n")

@@ -118,6 +118,8 @@ def test_unusable_files_and_folders_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DataError, match=message):
             Photographs(paths)
+    with pytest.raises(OptionError, match="no photographs are given"):
+        Photographs([])
 
 
 def test_a_list_has_the_camera_of_each_image(tmp_path: Path) -> None:
@@ -126,7 +128,7 @@ def test_a_list_has_the_camera_of_each_image(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text(
         "# NAME MODEL WIDTH HEIGHT PARAMS\n"
         "query/day/1.jpg PINHOLE 64 48 51 51 32 24\n"
-        "query/night/1.jpg PINHOLE 64 48 52 52 32 24\n"
+        "query/night/1.jpg PINHOLE 64.0 48.0 52 52 32 24\n"
         "query/day/2 b.jpg, SIMPLE_RADIAL, 128, 96, 106, 64, 48, 0.1\n"
     )
     cameras = read_cameras(tmp_path / "cameras.txt")

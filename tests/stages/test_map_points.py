@@ -162,6 +162,10 @@ def test_missing_poses_matches_and_depth_are_refused(
     matches, options = world.with_matches("mapping"), TriangulationOptions()
     with pytest.raises(DataError, match="no mapping image has a pose"):
         triangulate_map(world.query(), matches, "rootsift", tmp_path / "map", options)
+    first = dict(sorted(mapping.read().trajectories.items())[:1])
+    write_sensors(tmp_path / "one", replace(mapping.read(), trajectories=first))
+    with pytest.raises(DataError, match="one: points need two or more images with poses"):
+        triangulate_map(KaptureFolder(tmp_path / "one"), matches, "rootsift", tmp_path, options)
     with pytest.raises(DataError, match="no matches of type 'r2d2'"):
         triangulate_map(world.mapping(), matches, ["rootsift", "r2d2"], tmp_path / "map", options)
     assert not (tmp_path / "map").exists()

@@ -27,7 +27,7 @@ from megloc_kapture.evaluation.metrics import (
     Threshold,
     pose_errors,
 )
-from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
+from megloc_kapture.evaluation.scoring import NO_POSE, Evaluation, QueryResult
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.values import MIN_CONFIDENCE, PoseRefinement
 
@@ -102,13 +102,18 @@ def notes(evaluation: Evaluation) -> list[str]:
         )
     if row.num_missing == row.num_queries:
         sentences.append("no query has a pose")
+    elif absent := [q.image for q in evaluation.queries if q.reason == NO_POSE]:
+        lack = counted(len(absent), "query has", "queries have")
+        sentences.append(
+            f"{lack} no pose in the result: {_first(absent)}; if these are map images, give true "
+            "poses of the queries alone"
+        )
     missing = evaluation.without_truth
     if missing:
-        shown = ", ".join(missing[:_NAMES_SHOWN]) + (", ..." if missing[_NAMES_SHOWN:] else "")
         lack = counted(
             len(missing), "image has no true pose and is", "images have no true pose and are"
         )
-        sentences.append(f"{lack} not counted: {shown}")
+        sentences.append(f"{lack} not counted: {_first(missing)}")
         if evaluation.truth_known_by:
             sentences.append(evaluation.truth_known_by.rstrip("."))
         if not evaluation.estimated and row.num_missing == row.num_queries:
@@ -117,6 +122,10 @@ def notes(evaluation: Evaluation) -> list[str]:
         ignored = counted(number, "image with a true pose is", "images with a true pose are")
         sentences.append(f"{ignored} not scored by this benchmark")
     return sentences
+
+
+def _first(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMES_SHOWN]) + (", ..." if names[_NAMES_SHOWN:] else "")
 
 
 def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[str]:

@@ -143,11 +143,18 @@ class ImagePair:
 
 
 def read_pairs(path: Path | str) -> list[ImagePair]:
-    """Read a pairs file in its order, without repeated pairs."""
+    """Read a pairs file in its order, without repeated pairs.
+
+    Pairs without a score (hloc separates the two names by a blank) have the best one first.
+    """
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()
     with read_rows(Path(path)) as rows:
         for fields in rows:
+            if len(fields) == 1:
+                fields = fields[0].split()
+            if len(fields) == 2:
+                fields = [*fields, str(-len(pairs))]
             check_columns(fields, 3)
             pair = check_relative(fields[0]), check_relative(fields[1])
             (score,) = numbers_of(fields[2:], "score")

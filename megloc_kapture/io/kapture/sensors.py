@@ -48,12 +48,17 @@ def read_kapture_data(root: Path) -> KaptureData:
     """Read and check ``sensors/`` of a kapture; only sensors.txt must exist."""
     folder = root / "sensors"
     require(root.exists(), "no such kapture folder", path=root)
-    require(
-        folder.is_dir(),
-        "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
-        "--images` localizes them, `megloc map` makes a map of them",
-        path=root,
-    )
+    require(root.is_dir(), "a file; give a kapture folder", path=root)
+    if not folder.is_dir():
+        inner = ", ".join(sorted(p.parents[1].name for p in root.glob("*/sensors/sensors.txt")))
+        raise DataError(
+            f"no kapture folder, but {inner} in it: give one of them"
+            if inner
+            else "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
+            "--images` localizes them, `megloc map` makes a map of them. Poses? `megloc evaluate` "
+            "takes pose files and COLMAP models",
+            path=root,
+        )
     paths = {
         name: folder / f"{name}.txt"
         for name in _HEADERS
@@ -160,6 +165,7 @@ def read_records(
 def _record_key(
     fields: Sequence[str], devices: Collection[str], known: Collection[tuple[int, str]]
 ) -> tuple[int, str]:
+    require(re.fullmatch("[+-]?[0-9]+", fields[0]), f"timestamp {fields[0]!r} is not an integer")
     key = (int(fields[0]), fields[1])
     if key[1] not in devices:
         raise DataError(f"unknown sensor or rig {key[1]!r}")

@@ -103,7 +103,12 @@ IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n\n8 1 0 0 0 0 0 0 1 db/8.jpg\n\n"
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        ("cameras", "SIMPLE_RADIAL", "NEW", "Camera model does not exist"),
+        ("cameras", "SIMPLE_RADIAL", "NEW", "cameras.txt:1: expected a row NAME MODEL"),
+        ("cameras", " -0.0811", "", "cameras.txt:1: camera model SIMPLE_RADIAL takes 4 parameters"),
+        ("images", "0 0 1 db/8", "0 0 3 db/8", "images.txt:3: camera 3 is not in cameras.txt"),
+        ("images", "8 1", "7 1", "images.txt:3: image id 7 is listed twice"),
+        ("images", "7 1 0", "7 nan 0", "images.txt:1: expected finite numbers IMAGE_ID QW"),
+        ("images", "2 1 db/7.jpg", "2 1", "images.txt:1: 9 columns instead of 10"),
         ("cameras", "1600", "0", "cameras.txt: camera 1: image size 0x1067"),
         ("images", "7 1 0 0 0", "7 0 0 0 0", "images.txt: image 'db/7.jpg': .*quaternion"),
         ("images", "db/7", "../7", "images.txt: image '../7.jpg': .*leads out"),
@@ -120,6 +125,25 @@ def test_a_wrong_text_model_is_named(
     with pytest.raises(DataError, match=message) as caught:
         read_colmap_model(tmp_path)
     assert str(caught.value).startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("\n\n", "\n"),
+        lambda text: f"\ufeff# comment\n{text}".replace("\n", "\r\n"),
+        lambda text: text.replace("db/", "my photos/day 1/").replace("8.jpg", "8"),
+        lambda text: text.replace("db/", "db\\"),
+        lambda text: text.replace("db/7.jpg\n", "db/7.jpg\n1.5 2.5 -1 3 4 -1 5 6 -1 7 8 -1"),
+    ],
+    ids=["no lines of features", "Windows", "blanks in names", "backslashes", "features"],
+)
+def test_images_of_other_tools_are_read(tmp_path: Path, change: Callable[[str], str]) -> None:
+    for file, text in (("cameras", CAMERAS), ("images", change(IMAGES)), ("points3D", "")):
+        (tmp_path / f"{file}.txt").write_text(text, encoding="utf-8", newline="")
+    names = [image.name for image in read_colmap_model(tmp_path).images]
+    assert [name[-5:].removesuffix(".jpg")[-1] for name in names] == ["7", "8"]
+    assert len({name.rpartition("/")[0] for name in names} & {"db", "my photos/day 1"}) == 1
 
 
 def test_camera_models_that_kapture_lacks_are_refused_by_name(tmp_path: Path) -> None:

@@ -193,6 +193,9 @@ night      0.0-84.2       0.0-84.2       1.3-98.7      1.3-98.7
 all        0.5-71.6       5.3-85.3       14.7-94.7     28.4-99.5
 
 Note: too few queries (5) to compare recall: the intervals are wide.
+
+Note: 1 query has no pose in the result: n2; if these are map images, give true poses of the
+queries alone.
 """
 
 

@@ -20,7 +20,13 @@ from megloc_kapture.io.kapture.features import (
     feature_folder,
     list_types,
 )
-from megloc_kapture.io.kapture.matches import MatchesReader, MatchesWriter
+from megloc_kapture.io.kapture.matches import (
+    ImagePair,
+    MatchesReader,
+    MatchesWriter,
+    read_pairs,
+    write_pairs,
+)
 
 KEYPOINTS = FeatureConfig("name inside", np.dtype("float32"), 3)
 DESCRIPTORS = FeatureConfig("d", np.dtype("uint8"), 4, "k", "L2")
@@ -141,3 +147,13 @@ def test_files_named_in_the_other_order_are_read(tmp_path: Path) -> None:
     assert matches.pairs == [("a", "b")]
     assert np.array_equal(matches.read("b", "a")[0], INDICES)
     assert np.array_equal(matches.read("a", "b")[0], INDICES[:, ::-1])
+
+
+def test_pairs_read_back_in_their_order_without_repetitions(tmp_path: Path) -> None:
+    pairs = [ImagePair("q 2", "m/1", 1 / 3), ImagePair("q1", "m2", -1.0), ImagePair("m2", "q1", 2)]
+    write_pairs(tmp_path / "pairs.txt", [*pairs, ImagePair("q1", "m2", 5.0)])
+    assert read_pairs(tmp_path / "pairs.txt") == pairs
+    for text in ("q1 m2\nq1 m1\n", "q1, m2\nq1, m1\n"):  # hloc's, and without a score
+        (tmp_path / "pairs.txt").write_text(text)
+        best_first = [ImagePair("q1", "m2", 0.0), ImagePair("q1", "m1", -1.0)]
+        assert read_pairs(tmp_path / "pairs.txt") == best_first
