@@ -70,6 +70,7 @@ def test_images_are_resized_and_masked(
     image = images_of(scene)[0]
     assert image_size(new.image_path(image)) == (200, 144)
     mask = read_image_rgb(out / "sensors" / "masks" / f"{image}.png")[..., 0]
+    assert mask.shape == (144, 200)
     assert set(np.unique(mask)) == {0, 255} and (mask[-30:] == 0).all()
 
     # a second run without the mask leaves no mask of the first

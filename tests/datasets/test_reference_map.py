@@ -20,8 +20,6 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 from tests.worlds import one_camera
 
-import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
-
 # unsorted, with an image that is not imported
 NAMES = ("db/b.jpg", "db/a.jpg", "gone/c.jpg", "db/d.jpg")
 # point, image, feature, x, y
@@ -114,9 +112,12 @@ FEATURES = {"db/a.png": 10, "db/b.png": 901, "db/d.png": 0, "other.png": 2}
 
 
 def test_all_features_of_a_database_keep_their_numbers(tmp_path: Path) -> None:
-    written = write_database(tmp_path / "d.db", FEATURES, shift=0.01)
-    output = tmp_path / "map"
-    counts = write_reference_map(output, data(), {}, NAMES, points(), database=tmp_path / "d.db")
+    database = tmp_path / "all of it?#100%.db"
+    written = write_database(database, FEATURES, shift=0.01)
+    before, output = database.read_bytes(), tmp_path / "map"
+    counts = write_reference_map(output, data(), {}, NAMES, points(), database=database)
+    assert database.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == [database, output]  # no files of SQLite
     assert counts == {"images": 3, "keypoints": 911, "points": 4, "observations": 6}
     folder = KaptureFolder(output)
     folder.validate()
@@ -167,47 +168,11 @@ def test_the_exact_name_takes_precedence_over_another_suffix(tmp_path: Path) -> 
 # ------------------------------------------------------------------ the database
 
 
-def write_with_pycolmap(path: Path) -> dict[str, tuple[Any, Any]]:
-    """Write the schema of version 4, in WAL mode."""
-    rng = np.random.default_rng(0)
-    database = pycolmap.Database.open(str(path))
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[50.0, 32, 24])
-    camera_id = database.write_camera(camera)
-    written = {}
-    for name, count in {"db/7.jpg": 5, "rear/8.png": 3, "c.jpg": 0}.items():
-        image_id = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
-        keypoints = rng.uniform(0, 1000, (count, 4)).astype(np.float32)
-        values = rng.integers(0, 256, (count, 128)).astype(np.uint8)
-        database.write_keypoints(image_id, keypoints)
-        kind = pycolmap.FeatureExtractorType.SIFT
-        database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, values))
-        written[name] = (keypoints, values)
-    database.close()
-    return written
-
-
-def test_a_database_is_read_and_stays_unchanged(tmp_path: Path) -> None:
-    path = tmp_path / "all of it?#100%.db"
-    written = write_with_pycolmap(tmp_path / "plain.db")
-    (tmp_path / "plain.db").rename(path)
-    before = sorted(tmp_path.iterdir()), path.read_bytes()
-    with ColmapDatabase(path) as database:
-        assert list(database.images) == sorted(written)
-        for name, (keypoints, descriptors) in written.items():
-            assert np.array_equal(database.keypoints(name), keypoints[:, :2])
-            values = database.descriptors(name)
-            assert (values is None) == (len(keypoints) == 0)
-            assert values is None or np.array_equal(values, descriptors)
-        with pytest.raises(DataError, match="has no image 'd.jpg'"):
-            database.keypoints("d.jpg")
-        assert sorted(tmp_path.iterdir()) == before[0]  # no files of SQLite
-    assert (sorted(tmp_path.iterdir()), path.read_bytes()) == before
-
-
 def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "d.db"
-    write_with_pycolmap(path)
+    write_database(path, FEATURES)
     writer = sqlite3.connect(path)
+    writer.execute("PRAGMA journal_mode = WAL")  # as COLMAP writes
     writer.execute("UPDATE images SET name = 'new.jpg' WHERE image_id = 1")
     writer.commit()
     assert (tmp_path / "d.db-wal").stat().st_size > 0

@@ -157,30 +157,6 @@ def test_other_errors_are_not_retried(eight_at_once: None) -> None:
         batched(Limited(9), lambda _: [])
 
 
-def test_matches_of_a_batch(
-    shared_data: Path, frames: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(devices, "_limits", {})
-    weights = shared_data / "weights"
-    options = {"weights": str(weights / "xfeat" / "xfeat.pt"), "threshold": 0.02, "device": "cpu"}
-    extractor = load_plugin(LOCAL_FEATURES, "xfeat", options)
-    images = [
-        ImageFeatures(features.keypoints_px[:number], features.descriptors[:number], 144, 96)
-        for number, features in zip(
-            (200, 300, 150, 0, 250), (extractor.extract(image) for image, _ in frames), strict=True
-        )
-    ]
-    options = {"weights": str(weights / "lighterglue" / "xfeat-lighterglue.pt"), "device": "cpu"}
-    matcher = load_plugin(MATCHERS, "lighterglue", options)
-    first, *others = images
-    alone = [matcher.match(first, other) for other in others]
-    assert sum(len(matches) for matches, _ in alone) > 30
-    together = matcher.match_many(first, others)  # padded to one size
-    for (matches, scores), (expected, expected_scores) in zip(together, alone, strict=True):
-        np.testing.assert_array_equal(matches, expected)
-        np.testing.assert_allclose(scores, expected_scores, atol=1e-4)
-
-
 class ManySift(RootSift):
     """Extracts several images at once."""
 

@@ -22,8 +22,7 @@ from megloc_kapture.io.tables import (
     read_covariances,
     read_refinement,
 )
-from megloc_kapture.plugin_loading import plugin_names
-from megloc_kapture.plugins import POSE_REFINERS, PluginChoice, PoseRefinement
+from megloc_kapture.plugins import PoseRefinement
 from megloc_kapture.refinement.references import Displacement
 from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
@@ -147,21 +146,6 @@ def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_pa
     wrong = Chosen(refiners=(Shift(name="wrong"),))
     with pytest.raises(PluginError, match="'wrong' on image .*: refine returned NoneType"):
         refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
-
-
-def test_queries_without_depth_are_not_refined(
-    world: Any, localized: KaptureFolder, tmp_path: Path
-) -> None:
-    first = min(world.query_poses)
-    assert plugin_names(POSE_REFINERS) == ["field", "icp", "rendering"]
-    for name in ("icp", "rendering"):
-        options = PoseRefinementOptions(by=(PluginChoice(name=name),))
-        counts = refine_poses(world.mapping(), world.query(), localized, tmp_path / name, options)
-        assert counts[f"accepted_by_{name}"] == 0
-        ((step,),) = read_refinement(tmp_path / name / "refinement.csv", {}).values()
-        assert "depth" in step.reason
-        poses = KaptureFolder(tmp_path / name).read().poses()
-        assert poses[first] == localized.read().poses()[first]
 
 
 @pytest.fixture

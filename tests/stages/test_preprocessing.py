@@ -197,17 +197,6 @@ def test_all_masks_are_combined(street: KaptureFolder, tmp_path: Path) -> None:
     assert counts["images_masked"] == 6
 
 
-def test_masks_are_scaled_with_the_image_and_have_8_bits(
-    street: KaptureFolder, tmp_path: Path
-) -> None:
-    fixed = (FixedMask(camera="front", polygon=((0, 0), (0.5, 0), (0.5, 1), (0, 1))),)
-    new, _ = run(street, tmp_path / "new", {"fixed": fixed}, max_size_px=160)
-    path = new.root / "sensors" / "masks" / "front/0.png.png"
-    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert stored.dtype == np.uint8 and stored.shape == (96, 160)
-    assert (stored[:, :80] == 0).all() and (stored[:, 80:] == 255).all()
-
-
 def test_the_ego_vehicle_region_is_found_with_map_images(
     small_kapture: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
