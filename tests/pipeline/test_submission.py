@@ -12,6 +12,7 @@ from typing import Any
 import kapture
 import numpy as np
 import pytest
+from poses import random_pose
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
@@ -54,20 +55,14 @@ FAR = SimilarityTransform(
 )
 
 
-def random_poses(number: int, seed: int = 0) -> list[RigidTransform]:
-    turns = Rotation.random(number, random_state=seed).as_matrix()
-    shifts = np.random.default_rng(seed).normal(size=(number, 3)) * 20
-    return [RigidTransform.from_matrix(r, t) for r, t in zip(turns, shifts, strict=True)]
-
-
 class Dataset:
     """An imported rig of three cameras at four timestamps, and a result for it."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.tables, self.result = root, root / "megloc", root / "localized"
-        offsets = random_poses(3, seed=7)
-        self.rig = dict(zip(SIDES, offsets, strict=True))
-        self.cars = dict(zip((10, 20, 30, 40), random_poses(4), strict=True))
+        rng = np.random.default_rng(0)
+        self.rig = {side: random_pose(rng) for side in SIDES}
+        self.cars = {time: random_pose(rng) for time in (10, 20, 30, 40)}
         self.query = KaptureData(
             sensors=dict.fromkeys(SIDES, CAMERA),
             rigs={"car": self.rig},
@@ -129,7 +124,7 @@ def test_names_with_white_space_are_left_out(
 ) -> None:
     images = ["a b.jpg", "c d/e.jpg", "f.jpg"]
     records = {(time, "rear"): image for time, image in enumerate(images)}
-    poses = dict(zip(records, random_poses(3), strict=True))
+    poses = dict.fromkeys(records, RigidTransform.identity())
     data = KaptureData({"rear": CAMERA}, {}, poses, records)
     write_sensors(tmp_path / "localized", data)
     place = tmp_path / "poses.txt"
@@ -241,7 +236,8 @@ DUMMY = "0.0 0.0 0.0 0.0 0.0 0.0 1.0"
 
 def write_drives(root: Path) -> KaptureData:
     """Write a map, localized queries and relocalization pairs of 4Seasons; return both drives."""
-    poses = random_poses(7)
+    rng = np.random.default_rng(0)
+    poses = [random_pose(rng) for _ in STAMPS]
 
     def drive(numbers: range, posed: range) -> KaptureData:
         folder = "ref" if numbers.start == 0 else "test"

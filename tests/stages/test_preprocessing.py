@@ -9,6 +9,7 @@ import cv2
 import kapture.io.csv
 import numpy as np
 import pytest
+from images import texture
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
@@ -32,12 +33,6 @@ from tests.worlds import folder_bytes
 
 Image = NDArray[np.uint8]
 FISHEYE = Camera("OPENCV_FISHEYE", 240, 180, (120.0, 121.0, 119.0, 92.0, -0.02, 0.004, 0.0, 0.0))
-
-
-def cloudy(seed: int, height: int = 180, width: int = 240) -> Image:
-    rough = np.random.default_rng(seed).normal(size=(height, width, 3))
-    smooth = cv2.GaussianBlur(rough, (0, 0), 2.5)
-    return np.clip(128 + 45 * smooth / smooth.std(), 0, 255).astype(np.uint8)
 
 
 class Halves:
@@ -81,8 +76,8 @@ def street(tmp_path: Path) -> KaptureFolder:
         data.records_camera[t, "side"] = f"side/{t}.jpg"
         data.records_depth[t, "depth"] = f"depth/{t}.depth"
         data.trajectories[t, "car"] = RigidTransform((1.0, 0.0, 0.0, 0.0), (float(t), 0.5, 0.0))
-        write_image(records / "front" / f"{t}.png", cloudy(t, 200, 320))
-        write_image(records / "side" / f"{t}.jpg", cloudy(10 + t))
+        write_image(records / "front" / f"{t}.png", texture(200, 320, t))
+        write_image(records / "side" / f"{t}.jpg", texture(180, 240, 10 + t))
         write_depth_map(records / "depth" / f"{t}.depth", np.full((48, 64), 2.0 + t, np.float32))
     mask = np.full((200, 320), 255, np.uint8)
     mask[:, :80] = 0
@@ -159,11 +154,11 @@ def test_kapture_reads_the_output_and_only_changed_images_are_written(
 
 
 def test_png_is_exact_and_grey_images_stay_grey(small_kapture: Any, tmp_path: Path) -> None:
-    grey = np.repeat(cloudy(0)[..., :1], 3, axis=2)
-    folder = small_kapture({"colour.png": cloudy(0), "grey.png": grey, "grey.jpg": grey})
+    grey = np.repeat(texture(180, 240, 0)[..., :1], 3, axis=2)
+    folder = small_kapture({"colour.png": texture(180, 240, 0), "grey.png": grey, "grey.jpg": grey})
     cropped, _ = run(folder, tmp_path / "cropped", max_size_px=240)
     pixels = read_image_rgb(cropped.image_path("colour.png"))
-    np.testing.assert_array_equal(pixels, cloudy(0)[:176])
+    np.testing.assert_array_equal(pixels, texture(180, 240, 0)[:176])
     smaller, _ = run(folder, tmp_path / "smaller", max_size_px=200)
     for image in ("grey.png", "grey.jpg"):
         stored = cv2.imread(str(smaller.image_path(image)), cv2.IMREAD_UNCHANGED)
@@ -201,9 +196,9 @@ def test_the_ego_vehicle_region_is_found_with_map_images(
     small_kapture: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     def drive(name: str, count: int, seed: int) -> KaptureFolder:
-        images = {f"{t}.png": cloudy(seed + t) for t in range(count)}
+        images = {f"{t}.png": texture(180, 240, seed + t) for t in range(count)}
         for image in images.values():
-            image[150:] = cloudy(7)[150:]
+            image[150:] = texture(180, 240, 7)[150:]
         folder: KaptureFolder = small_kapture(images, name=name)
         return folder
 
@@ -227,7 +222,7 @@ def test_the_ego_vehicle_region_is_found_with_map_images(
 def test_damaged_files_are_named(street: KaptureFolder, tmp_path: Path) -> None:
     mask = street.root / "sensors" / "masks" / "front/1.png.png"
     image, small = street.image_path("side/1.jpg"), tmp_path / "small.png"
-    write_image(small, cloudy(0, 90, 120))
+    write_image(small, texture(90, 120, 0))
     for message, path, content in (
         ("mask is 120x90, its image 320x200", mask, small.read_bytes()),
         ("image is 120x90, its camera says 240x180", image, small.read_bytes()),

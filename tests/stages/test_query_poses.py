@@ -10,7 +10,7 @@ import kapture.io.csv
 import numpy as np
 import pandas
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import error_vector
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
@@ -50,9 +50,7 @@ def test_queries_are_localized_accurately(world: Any) -> None:
         assert error_m < 0.005 and error_deg < 0.05
         assert result.num_inliers > 100 and set(result.seconds) >= {"reading", "estimation"}
         assert set(result.candidates) <= set(world.map_poses)
-        delta = truth @ result.cam_from_world.inverse()
-        vector = Rotation.from_matrix(delta.rotation_matrix()).as_rotvec()
-        error = np.concatenate([vector, delta.translation])
+        error = error_vector(result.cam_from_world, truth)
         # six degrees of freedom, with room for errors of the map
         assert error @ np.linalg.solve(result.covariance, error) < 100
     with open_executor("processes", 2) as executor:

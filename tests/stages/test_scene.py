@@ -10,7 +10,7 @@ from typing import Any
 import kapture
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import random_pose
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import (
@@ -35,16 +35,14 @@ from megloc_kapture.values import Camera, Pose, RigidTransform
 CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))
 
 
-def random_pose(seed: int) -> RigidTransform:
-    rng = np.random.default_rng(seed)
-    return RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
-
-
 @pytest.fixture
 def data() -> KaptureData:
     """A car with three cameras at two timestamps, with one at a third, and a phone."""
     data = KaptureData(sensors={name: CAMERA for name in ("left", "rear", "right", "phone")})
-    data.rigs["car"] = {name: random_pose(k) for k, name in enumerate(("left", "rear", "right"))}
+    data.rigs["car"] = {
+        name: random_pose(np.random.default_rng(k))
+        for k, name in enumerate(("left", "rear", "right"))
+    }
     for timestamp in (1, 2):
         for name in data.sensors:
             data.records_camera[timestamp, name] = f"{name}/{timestamp}.jpg"
@@ -57,7 +55,7 @@ def kaptures(pose: RigidTransform) -> kapture.PoseTransform:
 
 
 def test_poses_are_carried_to_other_cameras_of_the_rig(data: KaptureData) -> None:
-    left = random_pose(9)
+    left = random_pose(np.random.default_rng(9))
     found = poses_through_rig(data, {"left/1.jpg": Pose(left, 20, 12)})
     sources = {image: source for image, (source, _) in found.items()}
     assert sources == {"rear/1.jpg": "left/1.jpg", "right/1.jpg": "left/1.jpg"}
@@ -72,9 +70,9 @@ def test_poses_are_carried_to_other_cameras_of_the_rig(data: KaptureData) -> Non
 
 def test_nested_rigs_equal_one_rig(data: KaptureData) -> None:
     flat = query_units(data, rigs=True)
-    localized = {"left/1.jpg": Pose(random_pose(9), 20, 12)}
+    localized = {"left/1.jpg": Pose(random_pose(np.random.default_rng(9)), 20, 12)}
     expected = poses_through_rig(data, localized)
-    car, front = data.rigs["car"], random_pose(8)
+    car, front = data.rigs["car"], random_pose(np.random.default_rng(8))
     nested = {name: car.pop(name) @ front.inverse() for name in ("left", "rear")}
     data.rigs = {"car": {**car, "front": front}, "front": nested}
     for unit, other in zip(query_units(data, rigs=True), flat, strict=True):
@@ -89,7 +87,10 @@ def test_nested_rigs_equal_one_rig(data: KaptureData) -> None:
 
 def test_the_camera_with_most_inliers_gives_the_pose(data: KaptureData) -> None:
     inliers = {"left/1": 30, "right/1": 31, "left/2": 8, "right/2": 8, "phone/2": 400}
-    localized = {f"{n}.jpg": Pose(random_pose(5), 500, count) for n, count in inliers.items()}
+    localized = {
+        f"{n}.jpg": Pose(random_pose(np.random.default_rng(5)), 500, count)
+        for n, count in inliers.items()
+    }
     sources = {image: source for image, (source, _) in poses_through_rig(data, localized).items()}
     assert sources == {"rear/1.jpg": "right/1.jpg", "rear/2.jpg": "left/2.jpg"}
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from corner import depth_m, pose_at, render, write_kapture
+from images import texture
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
@@ -114,12 +115,6 @@ def test_views_of_one_photograph(tmp_path: Path) -> None:
     assert np.linalg.norm(px_in_b - b, axis=1).mean() < 3
 
 
-def smooth_image() -> NDArray[np.uint8]:
-    noise = np.random.default_rng(0).normal(size=(240, 320, 3))
-    image = cv2.GaussianBlur(noise, (0, 0), 6)
-    return np.clip(128 + 40 * image / image.std(), 0, 255).astype(np.uint8)
-
-
 def bilinear(image: NDArray[np.uint8], px: NDArray[np.float64]) -> NDArray[np.float64]:
     at = (px - 0.5).T[::-1]
     channels = np.moveaxis(image.astype(np.float64), 2, 0)
@@ -128,7 +123,7 @@ def bilinear(image: NDArray[np.uint8], px: NDArray[np.float64]) -> NDArray[np.fl
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_view_follows_its_homography(seed: int) -> None:
-    image = smooth_image()
+    image = texture(240, 320, sigma_px=6.0)
     rng = np.random.default_rng(seed)
     view, view_from_image = random_view(image, (160, 120), rng)
     assert view.shape == (120, 160, 3)
