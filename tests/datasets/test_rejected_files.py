@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from megloc_kapture.datasets import fourseasons, robotcar
@@ -14,7 +13,6 @@ from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
 from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.text_lines import read_camera_rows, read_transform
-from megloc_kapture.values import Camera
 
 Reader = Callable[[Path], Any]
 TIME = 1602074877390449152
@@ -63,23 +61,8 @@ def test_line_ends_and_blanks_do_not_matter(tmp_path: Path, reader: Reader) -> N
         assert repr(reader(path)) == expected, other
 
 
-def test_images_with_cameras_are_read_in_their_order(tmp_path: Path) -> None:
-    path = tmp_path / "list.txt"
-    path.write_text(TEXTS[read_camera_rows])
-    assert list(read_camera_rows(path).items()) == [
-        ("query/day/a.jpg", Camera("SIMPLE_RADIAL", 1600, 1200, (1469.2, 800, 600, -0.0353))),
-        ("query/b.jpg", Camera("PINHOLE", 768, 1024, (971.838, 971.838, 384, 512))),
-    ]
-
-
-def test_a_transform_is_read_with_any_separator_and_numbers_of_scans_are_read(
-    tmp_path: Path,
-) -> None:
+def test_numbers_of_wrong_scans_are_read(tmp_path: Path) -> None:
     path = tmp_path / "file.txt"
-    for separator in (" ", ",", " , "):
-        path.write_text(MATRIX.replace(" ", separator))
-        moved = read_transform(path).apply(np.array([[1.0, 0, 0]]))
-        np.testing.assert_allclose(moved, [[5, 3, -0.1]], atol=1e-15)
     path.write_text(TEXTS[read_wrong_scans])
     assert read_wrong_scans(path) == {"008", "012", "031"}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,6 @@ from megloc_kapture.pipeline.plan import (
     Workspace,
     all_kept,
     describe,
-    fingerprint,
     read_manifest,
     run_plan,
 )
@@ -345,22 +343,6 @@ def test_publishing_replaces_outputs_and_keeps_linked_folders(tmp_path: Path) ->
         (out / "folder").mkdir()
         workspace.publish(out, ("folder",))
     assert [p.name for p in mine.iterdir()] == ["file"]
-
-
-def test_a_fingerprint_depends_on_content_and_not_on_order() -> None:
-    options = {"pair": (1, 2), "text": "x", "deep": {"a": 0.5, "b": [None, True]}}
-    mark = fingerprint("s", 1, options, {"a": "1"})
-    assert fingerprint("s", 1, dict(reversed(options.items())), {"a": "1"}) == mark
-    # as read from a manifest
-    assert fingerprint("s", 1, json.loads(json.dumps(options)), {"a": "1"}) == mark
-    changed = {
-        fingerprint("t", 1, options, {"a": "1"}),
-        fingerprint("s", 2, options, {"a": "1"}),
-        fingerprint("s", 1, options | {"pair": (2, 1)}, {"a": "1"}),
-        fingerprint("s", 1, options, {"a": "2"}),
-        fingerprint("s", 1, options, {"b": "1"}),
-    }
-    assert mark not in changed and len(changed) == 5
 
 
 @pytest.mark.parametrize("content", [b"", b'{"stage": "s"}', b"\xff\xfe"])

@@ -154,42 +154,17 @@ def test_seed_precision_and_initial_weights(
             torch.testing.assert_close(load_file(third)[key], value, rtol=0, atol=1e-5)
 
 
-def test_a_trained_matcher_is_read_by_the_matcher(
-    files: dict[str, str], walk: Path, tmp_path: Path
-) -> None:
-    output = tmp_path / "small.safetensors"
-    chosen = {"weights": files["xfeat"], "threshold": 0.0}
-    last = megloc.train(
-        "matcher",
-        output,
-        kaptures=[walk],
-        features="xfeat",
-        set={"features.options": chosen, "steps": 2, "layers": 2, "max_size_px": 200,
-             "pairs_per_step": 1, "max_keypoints": 50, "device": "cpu"},
-    )  # fmt: skip
-    assert last["step"] == 2 and np.isfinite(last["loss"])
-    matcher = SuperGlue(SuperGlueOptions(weights=str(output), device="cpu"))
-    sides = []
-    for name in ("1.png", "2.png"):
-        image = read_image_rgb(walk / "sensors" / "records_data" / name)
-        sides.append(megloc.extract("xfeat", image, **chosen, max_keypoints=50))
-    matches, scores = matcher.match(*sides)
-    assert matches.shape[1] == 2 and len(matches) == len(scores)
-
-
 def test_superpoint_descriptors_are_trained_and_read(
     files: dict[str, str], walk: Path, tmp_path: Path
 ) -> None:
     """Random weights: detector frozen, gradients through SuperGlue into the descriptors."""
     frozen = {"weights": files["superpoint"], "device": "cpu", "threshold": 0.0}
-    chosen = options(
-        files,
-        DescriptorOptions,
-        **{"features": {"name": "superpoint", "options": frozen}, "steps": 1, "layers": 2},
-        **{"pairs_per_step": 1, "learning_rate": 1e-3, "max_keypoints": 60},
-    )
     output = tmp_path / "night.safetensors"
-    train(chosen, output, kaptures=[KaptureFolder(walk)])
+    changes = {"features.options": frozen, "steps": 1, "layers": 2, "pairs_per_step": 1}
+    changes |= {"device": "cpu", "max_size_px": MAX_SIZE_PX, "max_keypoints": 60}
+    changes |= {"learning_rate": 1e-3, "sinkhorn_iterations": 10, "check_every": 2}
+    last = megloc.train("descriptor", output, kaptures=[walk], features="superpoint", set=changes)
+    assert last["step"] == 1 and np.isfinite(last["loss"])
     before, after = load_file(files["superpoint"]), load_file(output)
     assert set(after) == {key for key in before if not key.startswith("convP")}
     assert all(not torch.equal(after[key], before[key]) for key in after)
