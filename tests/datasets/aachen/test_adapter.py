@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from aachen_files import (
     ADDED,
@@ -20,22 +19,15 @@ from aachen_files import (
     write_v1_0,
     write_v1_1,
 )
-from kapture import flatten
-from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.values import Camera
 
 QUERY_CAMERA = Camera("SIMPLE_RADIAL", 8, 6, (7.5, 4.0, 3.0, -0.0353019))
-POSES = {
-    "db/7.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (-2.0, 0.0, 5.0)),
-    "db/1228.jpg": RigidTransform((0.0, 0.0, 0.0, 1.0), (1.0, 2.0, -3.0)),
-    "db/3.jpg": RigidTransform((0.5, 0.5, 0.5, 0.5), (40.0, -700.0, 8.0)),
-}
 
 
 def edit(path: str, old: str, new: str) -> Callable[[Path], None]:
@@ -68,17 +60,10 @@ def written(root: Path, output: Path, *, allow_missing: bool = False, **options:
     return output
 
 
-def assert_poses(data: KaptureData) -> None:
-    poses = data.poses()
-    for name, pose in POSES.items():
-        np.testing.assert_allclose(poses[name].matrix(), pose.matrix(), rtol=0, atol=1e-9)
-
-
 def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     out = written(root, tmp_path / "out")
     mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
-    assert mapping.poses().keys() == POSES.keys()
-    assert_poses(mapping)
+    assert mapping.poses().keys() == set(DATABASE)
     # the list has the cameras by name
     assert mapping.camera_of("db/7.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (10.5, 4, 3, -0.08))
     assert mapping.camera_of("db/3.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (12, 4.25, 3, -0.25))
@@ -95,25 +80,6 @@ def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     assert not (out / "query_gt").exists()
     for part, name in (("mapping", "db/7.jpg"), ("query", NIGHT[0])):
         assert KaptureFolder(out / part).image_path(name).samefile(root / "images_upright" / name)
-
-
-def test_version_1_1_is_read(root11: Path, tmp_path: Path) -> None:
-    out = written(root11, tmp_path / "out")
-    mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
-    assert mapping.poses().keys() == {*DATABASE, *SEQUENCE}
-    assert_poses(mapping)
-    assert mapping.poses()[SEQUENCE[0]].translation == (0, 0, 1)
-    # three cameras took five images
-    cameras = dict(zip((*DATABASE, *SEQUENCE), (9, 2, 9, 5, 5), strict=True))
-    for name, camera_id in cameras.items():
-        assert mapping.record_of(name)[1] == f"camera_{camera_id:05d}"
-    assert len({timestamp for timestamp, _ in mapping.records_camera}) == 5
-    assert mapping.camera_of(SEQUENCE[0]) == Camera("PINHOLE", 8, 6, (9.123456789012345, 9, 4, 3))
-    assert query.image_names() == sorted(DAY + NIGHT + ADDED)
-    theirs = kapture_from_dir(str(out / "mapping"))
-    assert (len(theirs.records_camera.data_list()), len(theirs.sensors)) == (5, 3)
-    assert all(pose.r is not None for *_, pose in flatten(theirs.trajectories))
-    assert len(kapture_from_dir(str(out / "query")).records_camera.data_list()) == 5
 
 
 def test_tables_have_the_names_conditions_and_protocol_of_the_challenge(
@@ -195,13 +161,7 @@ def test_the_model_of_the_chosen_version_is_required(root: Path) -> None:
 def test_the_reference_model_is_imported_on_request(root: Path, tmp_path: Path) -> None:
     assert not (written(root, tmp_path / "plain") / "reference").exists()
     output = written(root, tmp_path / "out", reference_model=True) / "reference"
-    theirs = kapture_from_dir(str(output))
-    assert theirs.points3d is not None and theirs.observations is not None
-    points = [[2, 0, 5, 255, 0, 9], [1, 1, 1, 1, 2, 3]]
-    np.testing.assert_array_equal(theirs.points3d.as_array(), points)
-    seen = [{image for image, _ in theirs.observations[point, "sift"]} for point in (0, 1)]
-    assert seen == [{"db/7.jpg", "db/3.jpg"}, {"db/3.jpg", "db/1228.jpg"}]
-    assert theirs.descriptors is None
+    assert not KaptureFolder(output).types("descriptors")
     for database in (None, root / "aachen.db"):
         if database is not None:
             database.touch()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from poses import error_vector, rigid
-from robotcar_files import CAMERAS, QUERIES, REFERENCE, TEST, TRAIN, ts, write_layout
+from robotcar_files import CAMERAS, QUERIES, TEST, TRAIN, ts, write_layout
 
 from megloc_kapture.datasets.official import OfficialDataset
 from megloc_kapture.datasets.robotcar import ImageKey
@@ -17,7 +17,7 @@ from megloc_kapture.datasets.robotcar.images import rig_of_model
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.kapture import write_sensors
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
 
 
 @pytest.fixture(scope="module")
@@ -37,33 +37,6 @@ def query_name(number: int, camera: str = "rear") -> str:
 
 def scored(dataset: OfficialDataset) -> set[str]:
     return {name for name, group in dataset.groups.items() if group.scored}
-
-
-@pytest.mark.parametrize("model", ["merged", "individual"])
-def test_map_poses_and_the_rig_follow_the_models_and_extrinsics(
-    downloaded: Path, model: str
-) -> None:
-    dataset = read(downloaded, model=model)
-    mapping = dataset.mapping
-    assert len(mapping.records_camera) == 9
-    for number in REFERENCE:
-        for k, camera in enumerate(CAMERAS):
-            name = f"overcast-reference/{camera}/{ts(number)}.jpg"
-            assert mapping.records_camera[ts(number), camera] == name
-            # the pose of the model, not of the rig, whose cameras are two metres apart
-            pose = mapping.trajectories[ts(number), camera]
-            np.testing.assert_allclose(pose.center(), [number, k, 0.25], atol=1e-12)
-            np.testing.assert_allclose(pose.rotation_matrix(), np.diag([-1.0, -1, 1]), atol=1e-12)
-            assert mapping.camera_of(name) == Camera("PINHOLE", 8, 6, (10.5, 10.0, 4.25, 3.5))
-    assert {type(timestamp) for timestamp, _ in mapping.trajectories} == {int}
-    # the rig is the inverse of the extrinsics
-    for data in (mapping, dataset.query):
-        assert list(data.rigs) == ["car"]
-        for camera, across in (("left", -1.0), ("rear", 0.0), ("right", 1.0)):
-            sensor_from_rig = data.rigs["car"][camera]
-            np.testing.assert_allclose(sensor_from_rig.center(), [across, 0.5, 2.0], atol=1e-12)
-            back = sensor_from_rig.rotation_matrix() @ [0.0, 0.0, -1.0]
-            np.testing.assert_allclose(back, [0.0, 0.0, 1.0], atol=1e-12)
 
 
 def test_version_2_has_training_and_test_images(downloaded: Path) -> None:
