@@ -55,15 +55,6 @@ def test_distortion_is_undone() -> None:
     assert np.abs(shown - expected).max() < 1.6  # grey levels; a pixel is half a level
 
 
-def test_masked_pixels_are_unused() -> None:
-    mask = np.ones((300, 400), bool)
-    mask[100:120, 50:80] = False
-    view = stereo_view(_ramps(CAMERA), CAMERA, pose_at((0, 0, 0), 0, 0), mask, 200)
-    assert view.mask is not None
-    assert not view.mask[50:60, 25:40].any()
-    assert view.mask.sum() >= view.mask.size - 12 * 17
-
-
 def test_sources_share_points_under_an_angle() -> None:
     xyz = np.random.default_rng(2).uniform([-1, -1, 9], [1, 1, 11], (60, 3))
     # 0 is the reference; 1 is next to it, 2 at 11 degrees, 3 at 60 degrees, 4 shares no points

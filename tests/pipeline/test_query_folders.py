@@ -204,16 +204,6 @@ def test_features_with_and_without_pyramid_are_interchangeable(
     assert all(results.values())
 
 
-def test_images_without_stored_features_are_named(workspace: Path, tmp_path: Path) -> None:
-    features = Path(shutil.copytree(workspace / "local_features", tmp_path / "local_features"))
-    name = KaptureFolder(workspace / "query").read().image_names()[2]
-    for suffix in ("kpt", "desc"):
-        (found,) = features.rglob(f"{name}.{suffix}")
-        found.unlink()
-    folder = KaptureFolder(workspace / "query", features_dirs=[tmp_path])
-    assert KaptureQueries(folder, KaptureMap.open(workspace / "map")).lacking("rootsift") == name
-
-
 def test_the_focal_length_of_an_uncalibrated_camera_is_estimated(
     queries: tuple[KaptureMap, KaptureFolder], workspace: Path
 ) -> None:

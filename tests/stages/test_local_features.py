@@ -25,16 +25,6 @@ def noise(height: int = 120, width: int = 160, seed: int = 0) -> Image:
     return np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1).astype(np.uint8)
 
 
-def test_extracted_features_are_stored(world: Any) -> None:
-    folder = world.query()
-    keypoints, descriptors = folder.keypoints("rootsift"), folder.descriptors("rootsift")
-    for image in world.query_poses:
-        expected = EXTRACTOR.extract(read_image_rgb(folder.image_path(image)))
-        np.testing.assert_array_equal(keypoints.read(image), expected.keypoints_px)
-        np.testing.assert_array_equal(descriptors.read(image), expected.descriptors)
-        assert len(expected.scores) > 300
-
-
 def test_masks_with_a_margin_remove_keypoints(small_kapture: Any, tmp_path: Path) -> None:
     folder = small_kapture({"a.png": noise(), "b.png": noise()})
     mask = np.zeros((120, 160, 3), dtype=np.uint8)

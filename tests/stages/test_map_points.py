@@ -74,13 +74,6 @@ def test_images_take_the_depth_of_their_moment_and_rig(
         np.testing.assert_allclose(record.image_from_depth.translation, [-offset_m, 0, 0])
 
 
-def test_points_lie_on_the_walls(world: Any, distance_to_walls: Any) -> None:
-    distance = distance_to_walls(world.map().points3d()[:, :3])
-    assert len(distance) > 300
-    assert np.median(distance) < 0.005
-    assert (distance < 0.05).mean() > 0.98
-
-
 KINDS = ("keypoints", "descriptors")
 
 

@@ -15,7 +15,7 @@ from poses import error_vector
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     COVARIANCE_FILE,
@@ -57,13 +57,6 @@ def test_queries_are_localized_accurately(world: Any) -> None:
         in_processes = world.localized(work=Work(executor))
     for a, b in zip(results, in_processes, strict=True):
         assert (a.cam_from_world, a.num_inliers) == (b.cam_from_world, b.num_inliers)
-
-
-def test_a_query_without_candidates_fails(world: Any) -> None:
-    only_b = [ImagePair("query/b.png", "right/2.png", 1.0)]
-    first, second = world.localized(only_b)
-    assert first == Failure("no map image is a candidate")
-    assert isinstance(second, Pose) and second.candidates == ("right/2.png",)
 
 
 class Brightness:
