@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,9 +107,7 @@ def test_a_prior_restricts_the_candidates(
         localizer.localize(image, camera, prior=["0003.jpg", "0001.jpg"])
 
 
-def test_candidates_are_ranked_by_retrieval_or_given(
-    opened: KaptureMap, queries: list[Query]
-) -> None:
+def test_candidates_are_ranked_by_retrieval(opened: KaptureMap, queries: list[Query]) -> None:
     narrow = Localizer(opened, options=few("query_pairs.top_k=2"))
     # neighbours along the walk, by VLAD of the local features
     neighbours = {"0007.jpg": {"0006.jpg", "0009.jpg"}, "0010.jpg": {"0008.jpg", "0009.jpg"}}
@@ -122,31 +119,6 @@ def test_candidates_are_ranked_by_retrieval_or_given(
         # within a prior, the best of those
         kept = replace(query, prior=("0000.jpg", "0002.jpg", "0009.jpg"))
         assert set(narrow.ranked(kept)) < set(kept.prior or ())
-    # given candidates are all taken, in their order
-    chosen = ["0005.jpg", "0003.jpg", "0002.jpg"]
-    given = {query.name: chosen for query in queries[1:]}
-    results = list(narrow.localize_many(queries, candidates=given))
-    assert results[0] == Failure("no map image is a candidate")
-    assert results[1].candidates == tuple(chosen)
-
-
-def test_many_queries_are_localized_lazily_and_in_order(
-    localizer: Localizer, queries: list[Query], truth: KaptureData
-) -> None:
-    read: list[str] = []
-
-    def given() -> Iterator[Query]:
-        for query in queries:
-            read.append(query.name)
-            yield query
-
-    results = localizer.localize_many(given())
-    assert read == []
-    first = next(results)
-    assert read == [queries[0].name]
-    for query, found in zip(queries, [first, *results], strict=True):
-        assert errors(found, truth.cam_from_world(query.name))[0] < 0.02
-    assert read == [query.name for query in queries]
 
 
 @pytest.mark.slow

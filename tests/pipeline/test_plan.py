@@ -241,21 +241,6 @@ def test_first_and_last_stage(plan: Plan) -> None:
         plan.run(first="c", last="a")
 
 
-def test_stages_before_the_first_are_not_checked(plan: Plan) -> None:
-    plan.run()
-    plan.options["a"] = {"extra": "?"}
-    plan.run(first="c")
-    assert plan.log == ["c"] and plan.result() == "abc"
-    plan.run()
-    assert plan.log == ["a", "b", "c"] and plan.result() == "a?bc"
-    # a stage that does not read the new output is kept
-    stages = plan.stages()
-    stages[2].reads = ("a.txt",)
-    run_plan(stages, plan.workspace)
-    reports = run_plan(stages, plan.workspace, first="b")
-    assert [r.state for r in reports] == ["skipped", "run", "kept"]
-
-
 def test_a_dry_run_runs_nothing(plan: Plan) -> None:
     lines: list[str] = []
     reports = plan.run(dry_run=True, say=lines.append)

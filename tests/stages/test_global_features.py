@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, PluginError
-from megloc_kapture.features.vlad import PcaWhitening, VladOptions, Vocabulary, aggregate
+from megloc_kapture.features.vlad import VladOptions, aggregate
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages import work as devices
@@ -20,7 +20,6 @@ from megloc_kapture.stages.global_features import (
     extract_global_features,
     extract_vlad,
     read_vocabulary,
-    write_vocabulary,
 )
 from megloc_kapture.stages.work import Work
 from tests.worlds import folder_bytes
@@ -124,20 +123,3 @@ def test_a_map_without_descriptors_is_refused(
     folder = world.mapping().with_features([tmp_path])
     with pytest.raises(DataError, match="no descriptors of type rootsift"):
         extract_vlad(folder, [folder], "rootsift", tmp_path / "out", VLAD)
-
-
-def test_a_stored_vocabulary_is_read_back(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    mean, projection = (rng.normal(size=size).astype(np.float32) for size in (30, (4, 30)))
-    centres = rng.normal(size=(2, 3, 5)).astype(np.float32)
-    assert read_vocabulary(tmp_path) is None
-    for whitening, size in ((None, None), (PcaWhitening(mean, projection), 4)):
-        options = VladOptions(assignment="soft", vocabularies=2, dimensions=size)
-        write_vocabulary(tmp_path / "v", Vocabulary(centres, whitening), "r2d2", options)
-        vocabulary, settings = read_vocabulary(tmp_path / "v") or pytest.fail("no vocabulary")
-        np.testing.assert_array_equal(vocabulary.centres, centres)
-        assert (settings.local_type, settings.options) == ("r2d2", options)
-        assert (vocabulary.whitening is None) == (whitening is None)
-    assert vocabulary.whitening is not None
-    np.testing.assert_array_equal(vocabulary.whitening.mean, mean)
-    np.testing.assert_array_equal(vocabulary.whitening.projection, projection)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations, pairwise, product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_priors
 from megloc_kapture.io.kapture import (
     ImagePair,
-    KaptureData,
     KaptureFolder,
     MatchesWriter,
     write_observations,
@@ -106,52 +105,29 @@ def test_methods_are_combined_and_retrieval_gives_the_score(folders: Folders) ->
     assert scores["left/0.png", "right/4.png"] == 1.0  # retrieval does not name it
 
 
-def shared_points(folder: KaptureFolder) -> dict[tuple[str, str], int]:
-    """Count the points that two images share, with sets."""
-    seen: dict[str, set[int]] = {}
-    for observations in folder.observations().values():
-        for point, image in zip(observations.point_ids, observations.image_ids, strict=True):
-            seen.setdefault(observations.image_names[image], set()).add(int(point))
-    return {(a, b): len(seen[a] & seen[b]) for a, b in combinations(sorted(seen), 2)}
-
-
 def test_map_pairs_by_covisibility_count_points_of_all_types(
     world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen, points = world.map().observations()["rootsift"], world.map().points3d()
-    other = replace(seen, keypoints_type="other", point_ids=seen.point_ids + len(points))
+    whole = world.map().observations()["rootsift"]
+    halves = {
+        name: replace(
+            whole,
+            keypoints_type=name,
+            point_ids=whole.point_ids[rows],
+            image_ids=whole.image_ids[rows],
+            keypoint_ids=whole.keypoint_ids[rows],
+        )
+        for name, rows in (("a", whole.point_ids % 2 == 0), ("b", whole.point_ids % 2 == 1))
+    }
     write_sensors(tmp_path, world.map().read())
-    write_points3d(tmp_path, np.concatenate([points] * 2))
-    write_observations(tmp_path, {"rootsift": seen, "other": other})
-    two_types = KaptureFolder(tmp_path)
-    shared = shared_points(two_types)
-    least = sorted(shared.values())[5]
-    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", least)
-    found = paired(two_types, by=("covisibility",))
-    expected = sorted(pair for pair, count in shared.items() if count >= least)
-    assert names(found) == expected and {pair.score for pair in found} == {1.0}
-    # images of one folder, points of another
-    assert paired(world.mapping(), two_types, by=("covisibility",)) == found
-    with pytest.raises(DataError, match="mapping: no map to pair images by co-visibility"):
-        paired(world.mapping(), by=("covisibility",))
-
-
-def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -> None:
-    images = sorted(world.map_poses)
-
-    def in_sequence(folder: KaptureFolder, **options: Any) -> list[tuple[str, str]]:
-        return names(paired(folder, by=("sequence",), sequence={"window": 1, **options}))
-
-    data = world.mapping().read()
-    sensors, taken = {**data.sensors, "other": data.sensors["cam"]}, {}
-    for (timestamp, sensor), image in data.records_camera.items():
-        taken[10 - timestamp, "other" if image.startswith("right") else sensor] = image
-    poses = {key: world.map_poses[image] for key, image in taken.items()}
-    write_sensors(tmp_path, KaptureData(sensors=sensors, trajectories=poses, records_camera=taken))
-    backwards = KaptureFolder(tmp_path)
-    left, right = tuple(images[:2]), images[2:]
-    assert in_sequence(backwards) == [left, *pairwise(right)]
-    assert in_sequence(backwards, loop=True) == [left, *combinations(right, 2)]
+    write_points3d(tmp_path, world.map().points3d())
+    write_observations(tmp_path, halves)
+    # more than an image pair shares in one of the halves
+    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", 500)
+    of_halves, of_whole = (
+        paired(folder, by=("covisibility",)) for folder in (KaptureFolder(tmp_path), world.map())
+    )
+    assert of_halves == of_whole != []
 
 
 FRAMES = Restrictions(

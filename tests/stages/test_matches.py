@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from megloc_kapture.matching.nearest_neighbours import NearestNeighbours, match_
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.matches import (
-    _sampled,
     best_pairs,
     check_given_poses,
     iterate_candidates,
@@ -121,18 +119,6 @@ def test_candidates_are_sorted_by_score_and_name() -> None:
         ImagePair("q1", "m1", 0.5),
     ]
     assert list(iterate_candidates(pairs)) == [("q1", ["m2", "m1", "m3"]), ("q2", ["m1"])]
-
-
-def test_sampled_pairs_include_the_most_similar_image_of_each() -> None:
-    """Of equal scores, the pair of neighbours in the sorted list."""
-    names = [f"{at:03}" for at in range(60)]
-    pairs = [ImagePair(b, a, 1.0) for a, b in itertools.combinations(names, 2)]
-    sampled = {(image, other) for image, others in _sampled(pairs) for other in others}
-    images = {image for pair in sampled for image in pair}
-    assert 6 * 6 <= len(images) <= 6 * 12
-    for image in images:
-        apart = [abs(int(a) - int(b)) for a, b in sampled if image in (a, b)]
-        assert min(apart) == 1
 
 
 def test_a_wrong_given_pose_is_a_warning(

@@ -173,7 +173,10 @@ def test_all_masks_are_combined(street: KaptureFolder, tmp_path: Path) -> None:
     new, counts = run(
         street,
         tmp_path / "new",
-        {"user_masks": user, "fixed": (FixedMask(camera="front", bottom_share=0.1),)},
+        {
+            "user_masks": user,
+            "fixed": (FixedMask(camera="front", polygon=((0, 0.9), (1, 0.9), (1, 1), (0, 1))),),
+        },
         segmenter=Halves(),
     )
     expected = np.ones((200, 320), bool)

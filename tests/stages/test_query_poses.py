@@ -37,7 +37,7 @@ from megloc_kapture.stages.query_poses import (
 )
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Pose, RigidTransform
 
 
 def test_queries_are_localized_accurately(world: Any) -> None:
@@ -195,29 +195,3 @@ def test_localized_queries_are_written_as_kapture_and_tables(world: Any, tmp_pat
     lines = (tmp_path / "timing.csv").read_text().splitlines()
     assert lines[0] == "image,step,seconds"
     assert {line.split(",")[1] for line in lines[1:]} >= {"reading", "estimation", "refinement"}
-
-
-@pytest.mark.parametrize(
-    ("fallback", "retrieved", "has_fallback"),
-    [("none", True, False), ("retrieval", False, False), ("retrieval", True, True)],
-)
-def test_a_failed_query_has_no_pose_without_a_fallback(
-    world: Any, tmp_path: Path, fallback: Any, retrieved: bool, has_fallback: bool
-) -> None:
-    fallback_pose = world.map_poses["left/1.png"]
-    first, second = world.localized()
-    results = [Failure("no map image matches", name=first.name), second]
-    counts = write_localized(
-        tmp_path, world.query(), results, fallback=fallback,
-        first_candidates={q: ("left/1.png", fallback_pose) for q in world.query_poses if retrieved},
-    )  # fmt: skip
-    assert counts == {"queries": 2, "localized": 1, "failed": 1, "fallbacks": int(has_fallback)}
-    written = KaptureFolder(tmp_path).read()
-    assert written.image_names() == sorted(world.query_poses)
-    assert written.poses().get("query/a.png") == (fallback_pose if has_fallback else None)
-    assert written.poses()["query/b.png"] != fallback_pose
-    status = read_status(tmp_path / STATUS_FILE)
-    a, b = status["query/a.png"], status["query/b.png"]
-    assert (a.status, a.reason, a.num_inliers) == ("failed", "no map image matches", 0)
-    assert a.fallback == ("retrieval" if has_fallback else "none")
-    assert (b.status, b.fallback) == ("localized", "none")
