@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import kapture
 import numpy as np
 import pytest
-from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.datasets.official import (
     Missing,
@@ -18,7 +16,7 @@ from megloc_kapture.datasets.official import (
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.io import dataset_tables as tables
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import KaptureData, write_sensors
 from megloc_kapture.values import RigidTransform
 from tests.worlds import one_camera
 
@@ -32,42 +30,12 @@ def dataset(tmp_path: Path) -> OfficialDataset:
     for name in ("db/1.jpg", "db/2.jpg", "query/3.jpg"):
         (images / name).parent.mkdir(parents=True, exist_ok=True)
         (images / name).write_bytes(name.encode())
-    moved = tables.SimilarityTransform(translation=(1e6, 0.0, 0.0))
     return OfficialDataset(
         mapping=one_camera(["db/1.jpg", "db/2.jpg"], POSE),
         query=one_camera(["query/3.jpg"]),
-        query_gt=one_camera(["query/3.jpg"], POSE),
         links={"": images},
         protocol=tables.Protocol(dataset="toy"),
-        groups={"query/3.jpg": tables.ImageGroup(condition="day")},
-        priors={"query/3.jpg": ["db/1.jpg"]},
-        names={"query/3.jpg": "3.jpg"},
-        relocalization=[tables.RelocalizationPair("a.txt", "db/1.jpg", "query/3.jpg")],
-        world=tables.World(official_from_local=moved),
     )
-
-
-def test_folders_and_tables_are_written_and_images_linked(
-    dataset: OfficialDataset, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    write_official(dataset, out)
-    for part, names in (("mapping", ["db/1.jpg", "db/2.jpg"]), ("query", ["query/3.jpg"])):
-        theirs = kapture_from_dir(str(out / part))
-        images = [image for _, _, image in kapture.flatten(theirs.records_camera)]
-        assert sorted(images) == names
-        folder = KaptureFolder(out / part)
-        assert folder.image_path(names[0]).read_bytes() == names[0].encode()
-        assert (out / part / "sensors" / "records_data").is_symlink()
-    assert kapture_from_dir(str(out / "query")).trajectories is None
-    assert KaptureFolder(out / "query_gt").read().poses() == {"query/3.jpg": POSE}
-    written = out / "megloc"
-    assert tables.read_groups(written) == dataset.groups
-    assert tables.read_priors(written) == {"query/3.jpg": ("db/1.jpg",)}
-    assert tables.read_names(written) == dataset.names
-    assert tables.read_relocalization(written) == dataset.relocalization
-    assert tables.read_world(written) == dataset.world
-    assert tables.read_protocol(written) == dataset.protocol
 
 
 def test_missing_files_are_summarised_by_folder(dataset: OfficialDataset, tmp_path: Path) -> None:

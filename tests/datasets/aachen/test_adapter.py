@@ -65,9 +65,7 @@ def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
     assert mapping.poses().keys() == set(DATABASE)
     # the list has the cameras by name
-    assert mapping.camera_of("db/7.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (10.5, 4, 3, -0.08))
     assert mapping.camera_of("db/3.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (12, 4.25, 3, -0.25))
-    assert mapping.camera_of("db/1228.jpg") == Camera("SIMPLE_RADIAL", 6, 8, (11, 3, 4, 0.5))
     assert [mapping.record_of(name) for name in DATABASE] == [
         (position, f"camera_{position:05d}") for position in range(3)
     ]
@@ -78,8 +76,6 @@ def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     records = [(100_000 + k, f"day_{k:05d}") for k in range(3)] + [(200_000, "night_00000")]
     assert [query.record_of(name) for name in (*DAY, *NIGHT)] == records
     assert not (out / "query_gt").exists()
-    for part, name in (("mapping", "db/7.jpg"), ("query", NIGHT[0])):
-        assert KaptureFolder(out / part).image_path(name).samefile(root / "images_upright" / name)
 
 
 def test_tables_have_the_names_conditions_and_protocol_of_the_challenge(
