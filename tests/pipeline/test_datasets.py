@@ -8,8 +8,8 @@ from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
 import pytest
+from aachen_files import NIGHT, write_v1_0
 
-from megloc_kapture.datasets.official import Count, DatasetCard, Missing, OfficialDataset
 from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.io.dataset_tables import Protocol, read_protocol
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
@@ -17,7 +17,6 @@ from megloc_kapture.pipeline.datasets import (
     SUMMARY_FILE,
     TWIN_PREFIX,
     BenchmarkFile,
-    DatasetChoice,
     choose_dataset,
     dataset_names,
     find_benchmark,
@@ -29,31 +28,6 @@ from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS
 from megloc_kapture.values import Camera, RigidTransform
 
 OFFICIAL = ("4seasons", "aachen", "inloc", "robotcar")
-
-
-class Toy:
-    """A dataset of one map image and one query."""
-
-    name = "toy"
-    card = DatasetCard(title="Toy", published_at="x", size="1 kB", folders=(), layout="1.jpg")
-
-    def check(self, root: Path) -> None:
-        if not (root / "1.jpg").is_file():
-            raise DataError("1.jpg is missing", path=root)
-
-    def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        sensor = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 10, 8, (9.0, 5.0, 4.0)))
-        missing = Missing(root)
-        missing.require(root / "2.jpg")
-        posed = {(0, "c"): RigidTransform.identity()}
-        return OfficialDataset(
-            mapping=KaptureData({"c": sensor}, {}, posed, {(0, "c"): "1.jpg"}),
-            query=KaptureData({"c": sensor}, {}, {}, {(0, "c"): "2.jpg"}),
-            links={"": root},
-            protocol=Protocol(dataset="toy"),
-            summary=[Count("queries", 1, 2)],
-            missing=missing,
-        )
 
 
 @pytest.mark.parametrize("name", OFFICIAL)
@@ -107,23 +81,18 @@ def test_without_megloc_twins_the_message_has_the_remedy(
 
 
 def test_an_import_writes_a_summary_and_the_changed_protocol(tmp_path: Path) -> None:
-    root = tmp_path / "root"
-    root.mkdir()
-    choice = DatasetChoice("toy", root, Toy())
-    with pytest.raises(DataError, match="1.jpg is missing"):
-        choice.check()
-    (root / "1.jpg").touch()
-    choice.check()
-    with pytest.raises(DataError, match="1 files are missing: 2.jpg; --allow-missing"):
-        choice.import_to(root, tmp_path / "out")
-    choice = DatasetChoice("toy", root, Toy(), allow_missing=True)
-    counts = choice.import_to(
-        root, tmp_path / "out", lambda given: given.model_copy(update={"truth": "mine"})
+    root, out = write_v1_0(tmp_path / "root"), tmp_path / "out"
+    (root / "images_upright" / NIGHT[0]).unlink()
+    choice = choose_dataset("aachen", root)
+    with pytest.raises(DataError, match="1 files are missing: .*--allow-missing"):
+        choice.import_to(root, out)
+    counts = replace(choice, allow_missing=True).import_to(
+        root, out, lambda given: given.model_copy(update={"truth": "mine"})
     )
-    assert counts == {"map_images": 1, "queries": 1, "queries_with_truth": 0}
-    assert read_protocol(tmp_path / "out" / "megloc").truth == "mine"
-    text = (tmp_path / "out" / SUMMARY_FILE).read_text()
-    assert "published: 2, -1" in text and "2.jpg" in text
+    assert counts == {"map_images": 3, "queries": 3, "queries_with_truth": 0}
+    assert read_protocol(out / "megloc").truth == "mine"
+    text = (out / SUMMARY_FILE).read_text()
+    assert "published: 824, -821" in text and NIGHT[0] in text
 
 
 FILES = sorted(Path(__file__).parents[2].glob("benchmarks/*.toml"))
