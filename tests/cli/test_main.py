@@ -1,13 +1,15 @@
-"""The command itself: help, options, wrong arguments, signals, pipes, shell completion."""
+"""The command itself: help, options, wrong arguments, signals, shell completion, serve."""
 
 from __future__ import annotations
 
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +18,7 @@ import megloc_kapture
 from megloc_kapture.cli.info import shown
 from megloc_kapture.cli.main import COMMANDS, main
 from megloc_kapture.pipeline.presets import BASIC_OPTIONS, PRESETS, options_of, options_of_preset
+from megloc_kapture.service import server
 from megloc_kapture.stages.options import PipelineOptions
 
 WRONG_ARGUMENTS = {
@@ -126,3 +129,27 @@ def test_options_are_listed_by_stage_key_and_plugin(megloc: Any) -> None:
 def test_the_version(megloc: Any) -> None:
     assert megloc("--version").out == f"megloc-kapture {version('megloc-kapture')}\n"
     assert megloc_kapture.__version__ == version("megloc-kapture")
+
+
+@pytest.fixture
+def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that is not refused must not wait for clients."""
+    monkeypatch.setattr(server, "serve", lambda *_, **__: pytest.fail("it is served"))
+
+
+@pytest.mark.usefixtures("no_server")
+def test_a_port_in_use_is_refused_before_the_map_is_read(megloc: Any, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        megloc("serve", tmp_path, "--port", port).refused(f"port {port}: .*in use")
+
+
+@pytest.mark.usefixtures("no_server")
+def test_without_the_extra_the_installation_is_named(
+    megloc: Any, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("megloc_kapture.service")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    line = megloc("serve", finished / "map").refused("uvicorn is not installed")
+    assert line.endswith('pip install "megloc-kapture[serve]"')
