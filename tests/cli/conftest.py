@@ -79,12 +79,6 @@ def workspace(finished: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def virtual_gallery(shared_data: Path) -> Path:
-    """A real map of another tool: map/, query/ and query_gt/; read only."""
-    return shared_data / "foreign_maps" / "virtual_gallery"
-
-
-@pytest.fixture(scope="session")
 def foreign_map(finished: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small scene as the map of another tool: map/, query/, query_gt/; read only."""
     root = tmp_path_factory.mktemp("foreign")

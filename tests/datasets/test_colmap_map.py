@@ -11,6 +11,7 @@ from typing import Any
 import kapture.io.csv
 import numpy as np
 import pytest
+from camera_models import CAMERAS
 from PIL import Image
 
 from megloc_kapture.datasets.colmap_map import (
@@ -52,26 +53,8 @@ def execute(room: Path, statement: str, *values: Any) -> None:
     connection.close()
 
 
-# a camera of every model that kapture has
-CAMERAS = {
-    "SIMPLE_PINHOLE": (900.0, 640, 480),
-    "PINHOLE": (900.0, 905, 640, 480),
-    "SIMPLE_RADIAL": (900.0, 640, 480, 0.03),
-    "RADIAL": (900.0, 640, 480, 0.03, -0.01),
-    "OPENCV": (900.0, 905, 640, 480, 0.03, -0.01, 0.001, 0.002),
-    "OPENCV_FISHEYE": (900.0, 905, 640, 480, 0.03, -0.01, 0.001, 0.002),
-    "FULL_OPENCV": (900.0, 905, 640, 480, 0.03, -0.01, 0.001, 0.002, 0.01, 0.01, 0.01, 0.01),
-    "FOV": (900.0, 905, 640, 480, 0.3),
-    "SIMPLE_RADIAL_FISHEYE": (900.0, 640, 480, 0.03),
-    "RADIAL_FISHEYE": (900.0, 640, 480, 0.03, -0.01),
-    "THIN_PRISM_FISHEYE": (900.0, 905, 640, 480, 0.03, -0.01, 0.001, 0.002, 0.01, 0.01, 0, 0.01),
-    "SIMPLE_FISHEYE": (900.0, 640, 480),
-    "FISHEYE": (900.0, 905, 640, 480),
-}
-
-
 def synthetic(root: Path) -> Any:
-    """Write COLMAP's synthetic scene with rigs of three cameras of different models."""
+    """Write COLMAP's synthetic scene: rigs of three cameras, of every model that kapture has."""
     pycolmap.set_random_seed(3)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 5, 3, 2
@@ -79,10 +62,11 @@ def synthetic(root: Path) -> Any:
     (root / "sparse").mkdir(parents=True)
     database = pycolmap.Database.open(root / "database.db")
     made = pycolmap.synthesize_dataset(options, database)
-    models = list(CAMERAS.items()) * 2
-    for (_, camera), (model, params) in zip(sorted(made.cameras.items()), models, strict=False):
+    models = [(camera.model, camera.params) for camera in CAMERAS.values()]
+    models += [("SIMPLE_FISHEYE", (500.0, 321, 238.5)), ("FISHEYE", (500.0, 510, 321, 238.5))]
+    for (_, camera), (model, params) in zip(sorted(made.cameras.items()), models * 2, strict=False):
         camera.model, camera.params = getattr(pycolmap.CameraModelId, model), params
-        camera.width, camera.height = 1280, 960
+        camera.width, camera.height = 640, 480
         database.update_camera(camera)
     database.close()
     made.write_binary(root / "sparse")
@@ -98,6 +82,8 @@ def test_poses_rigs_and_projections_equal_those_of_colmap(tmp_path: Path) -> Non
     seen = folder.observations()["sift"]
     points = np.array([point.xyz for _, point in sorted(truth.points3D.items())])
     np.testing.assert_allclose(xyz, points, rtol=0, atol=1e-9)
+    colours = [point.color for _, point in sorted(truth.points3D.items())]
+    np.testing.assert_array_equal(folder.points3d()[:, 3:], colours)
     order = {point_id: row for row, point_id in enumerate(sorted(truth.points3D))}
     assert theirs.rigs is not None and len({rig for rig, _ in theirs.rigs.key_pairs()}) == 5
     for image in truth.images.values():

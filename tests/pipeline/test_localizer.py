@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,25 @@ def test_candidates_are_ranked_by_retrieval(opened: KaptureMap, queries: list[Qu
         # within a prior, the best of those
         kept = replace(query, prior=("0000.jpg", "0002.jpg", "0009.jpg"))
         assert set(narrow.ranked(kept)) < set(kept.prior or ())
+
+
+def test_many_queries_are_localized_lazily_and_in_order(
+    localizer: Localizer, queries: list[Query], truth: KaptureData
+) -> None:
+    read: list[str] = []
+
+    def given() -> Iterator[Query]:
+        for query in queries:
+            read.append(query.name)
+            yield query
+
+    results = localizer.localize_many(given())
+    assert read == []
+    first = next(results)
+    assert read == [queries[0].name]
+    for query, found in zip(queries, [first, *results], strict=True):
+        assert errors(found, truth.cam_from_world(query.name))[0] < 0.02
+    assert read == [query.name for query in queries]
 
 
 @pytest.mark.slow

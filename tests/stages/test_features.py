@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.features.vlad import VladOptions, aggregate
+from megloc_kapture.features.vlad import PcaWhitening, VladOptions, Vocabulary, aggregate
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
@@ -23,6 +23,7 @@ from megloc_kapture.stages.global_features import (
     extract_global_features,
     extract_vlad,
     read_vocabulary,
+    write_vocabulary,
 )
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.work import Work
@@ -204,3 +205,18 @@ def test_a_map_without_descriptors_is_refused(
     folder = world.mapping().with_features([tmp_path])
     with pytest.raises(DataError, match="no descriptors of type rootsift"):
         extract_vlad(folder, [folder], "rootsift", tmp_path / "out", VLAD)
+
+
+def test_a_stored_vocabulary_is_read_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    mean, projection, centres = (
+        rng.normal(size=size).astype(np.float32) for size in (30, (4, 30), (2, 3, 5))
+    )
+    vocabulary = Vocabulary(centres, PcaWhitening(mean, projection))
+    write_vocabulary(tmp_path, vocabulary, "r2d2", VladOptions(vocabularies=2, dimensions=4))
+    stored, settings = read_vocabulary(tmp_path) or pytest.fail("no vocabulary")
+    assert (settings.local_type, settings.options.vocabularies) == ("r2d2", 2)
+    assert stored.whitening is not None
+    np.testing.assert_array_equal(stored.centres, centres)
+    np.testing.assert_array_equal(stored.whitening.mean, mean)
+    np.testing.assert_array_equal(stored.whitening.projection, projection)

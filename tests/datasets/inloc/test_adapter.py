@@ -1,4 +1,4 @@
-"""InLoc, on a small download written by hand: a scanner in a box, on two floors."""
+"""InLoc, on a small download written by hand: a scan on each of two floors."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import DATASETS
 from megloc_kapture.values import Camera
 
 
@@ -100,19 +98,6 @@ def test_each_floor_is_a_coordinate_frame(output: Path) -> None:
     assert {groups[i].frame for i in KaptureFolder(output / "query").read().image_names()} == {""}
     assert read_protocol(output / "megloc").conditions == ("DUC1", "DUC2")
     assert not (output / "query_gt").exists()
-
-
-def test_depth_sensors_share_a_rig_with_the_cameras_and_are_optional(downloaded: Path) -> None:
-    data = read(downloaded).mapping
-    assert list(data.rigs) == ["cutout_40x30_rig"]
-    assert {device for _, device in data.trajectories} == {"cutout_40x30_rig"}
-    assert len({timestamp for timestamp, _ in data.records_camera}) == 72
-    adapter = load_plugin(DATASETS, "inloc", {"depth": False})
-    assert isinstance(adapter, InLoc)
-    without = adapter.read(downloaded).mapping
-    assert not without.rigs and not without.records_depth
-    for image, pose in data.poses().items():
-        np.testing.assert_allclose(without.poses()[image].matrix(), pose.matrix(), atol=1e-12)
 
 
 def test_distractor_floors_are_imported_on_request(root: Path) -> None:
