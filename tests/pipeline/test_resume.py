@@ -20,27 +20,17 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.stages.work import Work
 from tests.worlds import folder_bytes
 
-PLUGINS = '''
-import cv2
-import numpy as np
-from megloc_kapture.values import LocalFeatures
+PLUGINS = """
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from patches.size import SIZE
 
 
-class Corners:
-    """Grey values around strong corners."""
-
+class Corners(RootSift):
     name = "corners"
 
-    def extract(self, image, mask=None):
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        found = cv2.goodFeaturesToTrack(grey, 60, 0.01, 7).reshape(-1, 2)
-        rows = np.stack([cv2.getRectSubPix(grey, (9, 9), tuple(map(float, p))) for p in found])
-        rows = rows.reshape(len(rows), -1).astype(np.float32)
-        rows -= rows.mean(axis=1, keepdims=True)
-        rows = rows / np.linalg.norm(rows, axis=1, keepdims=True) + SHIFT
-        keypoints = np.float32(found + 0.5)
-        return LocalFeatures(keypoints, np.ones(len(found), np.float32), rows)
-'''
+    def __init__(self, options=None):
+        super().__init__(RootSiftOptions(max_keypoints=SIZE))
+"""
 ENTRIES = """
 [megloc_kapture.local_features]
 corners = patches.plugins:Corners
@@ -59,8 +49,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = site / "patches"
     folder.mkdir()
     (folder / "__init__.py").touch()
-    (folder / "shift.py").write_text("SHIFT = 0\n")
-    (folder / "plugins.py").write_text(f"from patches.shift import SHIFT\n{PLUGINS}")
+    (folder / "size.py").write_text("SIZE = 60\n")
+    (folder / "plugins.py").write_text(PLUGINS)
     monkeypatch.syspath_prepend(site)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     yield folder
@@ -162,7 +152,7 @@ def test_a_changed_plugin_runs_again(runs: Runs, package: Path) -> None:
     assert reports["local_features"].why == "code of patches.plugins.Corners changed"
     assert reports["mapping_matches"].why == "local_features changed"
     # another module of the package
-    (package / "shift.py").write_text("SHIFT = 1\n")
+    (package / "size.py").write_text("SIZE = 61\n")
     assert runs.run(last="local_features")["local_features"].why.startswith("code of patches")
     # a new release
     metadata = package.parent / "patches-1.2.dist-info" / "METADATA"

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import kapture
 import numpy as np
 import pytest
 from poses import random_pose
@@ -31,7 +30,7 @@ from megloc_kapture.io.dataset_tables import (
     write_world,
 )
 from megloc_kapture.io.files import write_json_model
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.tables import write_status
 from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import Run
@@ -153,15 +152,6 @@ def test_the_list_of_names_sets_names_and_order(dataset: Dataset, tmp_path: Path
     assert list(found) == list(names.values())
     assert found["rear/30.png"] == dataset.true_pose("night/rear/30.jpg")
     assert (counts["scored"], counts["poses"]) == (3, 3)
-
-
-def test_kapture_reads_poses_in_the_ltvl_format(dataset: Dataset, tmp_path: Path) -> None:
-    dataset.localize(["dawn/rear/10.jpg"], {})
-    submit(dataset, tmp_path / "poses.txt")
-    name, *numbers = (tmp_path / "poses.txt").read_text().split()
-    stored = KaptureFolder(dataset.result).read().poses()[name]
-    theirs = kapture.PoseTransform([float(v) for v in numbers[:4]], [float(v) for v in numbers[4:]])
-    np.testing.assert_allclose(theirs.inverse().t_raw, stored.center(), atol=1e-9)
 
 
 def test_poses_are_written_in_the_official_frame(dataset: Dataset, tmp_path: Path) -> None:

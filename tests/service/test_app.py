@@ -138,6 +138,17 @@ def test_the_page_needs_no_network(client: TestClient) -> None:
     assert "default-src 'none'" in page.headers["content-security-policy"]
 
 
+def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
+    seen = client.get("/map").json()
+    axes = np.array([seen["right"], seen["up"]])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-8)
+    centers = np.array([pose.center() for pose in localizer.map.poses.values()])
+    np.testing.assert_allclose(seen["origin"], centers.mean(axis=0))
+    flat = np.reshape(seen["cameras"], (-1, 4))
+    np.testing.assert_allclose(flat[:, :2], (centers - seen["origin"]) @ axes.T, rtol=1e-3)
+    assert seen["images"] == len(flat) == 7 and len(seen["points"]) > 200
+
+
 # ------------------------------------------------------------------------------------- refusals
 
 
