@@ -167,9 +167,6 @@ def test_device_and_precision_of_networks_are_chosen_by_flags(
     megloc(*run, "--preset", "modern", "--device", "gpu").refused("option device: String should")
 
 
-INLINE = ("--executor", "inline")
-
-
 @pytest.fixture
 def camera(scene: Path) -> str:
     """Id of the scene's camera."""

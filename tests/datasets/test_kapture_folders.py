@@ -12,7 +12,6 @@ import pytest
 
 from megloc_kapture.datasets.kapture_folders import import_kapture_folders, input_files
 from megloc_kapture.datasets.official import (
-    Missing,
     OfficialDataset,
     read_ground_truth,
     write_official,
@@ -179,22 +178,6 @@ def dataset(tmp_path: Path) -> OfficialDataset:
         links={"": images},
         protocol=tables.Protocol(dataset="toy"),
     )
-
-
-def test_missing_files_are_summarised_by_folder(dataset: OfficialDataset, tmp_path: Path) -> None:
-    root = tmp_path / "official"
-    missing = Missing(root)
-    assert missing.require(root / "images/db/1.jpg")
-    for name in ("night/1.jpg", "night/2.jpg", "night/3.jpg", "lists/night.txt"):
-        assert not missing.require(root / "images" / name)
-    message = (
-        r"official: 4 files are missing: images/lists/night\.txt, images/night/1\.jpg and 2 more "
-        r"in its folder; --allow-missing imports the rest$"
-    )
-    with pytest.raises(DataError, match=message):
-        write_official(replace(dataset, missing=missing), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    write_official(replace(dataset, missing=missing), tmp_path / "out", allow_missing=True)
 
 
 @pytest.mark.parametrize(

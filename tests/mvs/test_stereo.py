@@ -1,8 +1,10 @@
-"""Views for stereo, and depth by plane sweep against the exact depth of two walls."""
+"""Views for stereo, plane sweep and its loops, and COLMAP's stereo, on two exact walls."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise, product
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,12 +12,18 @@ import pytest
 from corner import CAMERA, WALLS, depth_m, pose_at, render
 from numpy.typing import NDArray
 
+from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays, project, px_from_cam, scaled_camera
+from megloc_kapture.io.colmap import MapImage
+from megloc_kapture.io.colmap_mapping import has_cuda, map_path, read_map, write_workspace
+from megloc_kapture.mvs.kernels import add_path, best_labels, correlate
 from megloc_kapture.mvs.sweep import (
     CALIBRATION,
+    ColmapStereo,
     Sweep,
     as_estimate,
     matching_deviations,
+    planes_of,
     refine,
     stereo_image,
 )
@@ -31,6 +39,9 @@ from megloc_kapture.mvs.views import (
 )
 from megloc_kapture.plugins import DepthEstimate, DepthEstimator, StereoView
 from megloc_kapture.values import Camera
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
 
 POSES = [pose_at((x, 0.1 * (-1) ** i, 0.0), 0.5 * i, 0.0) for i, x in enumerate((0, -0.5, 0.5))]
 RANGE = (3.0, 9.0)
@@ -253,3 +264,178 @@ def test_a_pixel_of_error_moves_depth_as_the_baseline_says() -> None:
     np.testing.assert_array_equal(
         with_pose_errors(reference, [near], estimate, (2.0, 8.0), 0.0).sigma_m, estimate.sigma_m
     )
+
+
+P1, P2, EDGE = 7.0, 40.0, 20.0
+
+
+def least_costs(
+    cost: NDArray[np.uint8], grey: NDArray[np.float32], path: list[tuple[int, int]]
+) -> list[float]:
+    """Least cost of all label sequences along a path, for each label of its last pixel."""
+    least = [np.inf] * 3
+    for labels in product(range(3), repeat=len(path)):
+        total = float(sum(cost[pixel][label] for pixel, label in zip(path, labels, strict=True)))
+        for (first, a), (second, b) in pairwise(zip(path, labels, strict=True)):
+            step = abs(float(grey[first] - grey[second]))
+            total += P1 * abs(a - b) if abs(a - b) <= 1 else max(P1, P2 * EDGE // (EDGE + step))
+        least[labels[-1]] = min(least[labels[-1]], total)
+    return least
+
+
+@pytest.mark.parametrize("direction", [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1)])
+def test_path_costs_equal_the_minimum_over_label_sequences(direction: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    cost = rng.integers(0, 60, (4, 5, 3)).astype(np.uint8)
+    grey = rng.uniform(0, 100, (4, 5)).astype(np.float32)
+    total = np.zeros(cost.shape, np.uint16)
+    dy, dx = direction
+    add_path(cost, grey, P1, P2, EDGE, dy, dx, total)
+    for y, x in np.ndindex(4, 5):
+        steps = range(max(cost.shape))
+        path = [(y - k * dy, x - k * dx) for k in steps]
+        path = [(v, u) for v, u in path if 0 <= v < 4 and 0 <= u < 5][::-1]
+        before = min(least_costs(cost, grey, path[:-1])) if len(path) > 1 else 0.0
+        expected = [least - before for least in least_costs(cost, grey, path)]
+        assert total[y, x].tolist() == expected
+
+
+def test_the_best_label_is_the_minimum_of_the_parabola() -> None:
+    truth = np.array([[2.3, 5.0, 6.75]])
+    labels = np.arange(9)
+    total = (100 * (labels - truth[..., None]) ** 2).round().astype(np.uint16)
+    result = np.empty(truth.shape)
+    best_labels(total, result)
+    np.testing.assert_allclose(result, truth, atol=0.01)
+
+
+def test_the_cost_is_the_mean_of_the_two_best_correlations() -> None:
+    rng = np.random.default_rng(1)
+    reference = rng.normal(size=(20, 24)).astype(np.float32)
+    sources = np.stack(
+        [reference * 3 + 10, reference + rng.normal(size=reference.shape), -reference]
+    ).astype(np.float32)
+    sources[0, :, 15:] = np.nan
+    costs = np.empty(reference.shape, np.uint8)
+    correlate(reference, sources, 3, costs)
+
+    def zncc(source: int, y: int, x: int) -> float:
+        window = np.s_[y - 3 : y + 4, x - 3 : x + 4]
+        return float(np.corrcoef(reference[window].ravel(), sources[source][window].ravel())[0, 1])
+
+    # windows with a NaN do not count, and neither does the third image
+    assert costs[10, 8] == int(255 * (1 - (1 + zncc(1, 10, 8)) / 2))
+    assert costs[10, 19] == min(255, int(255 * (1 - (zncc(1, 10, 19) - 1) / 2)))
+    assert (costs[:3] == 255).all() and (costs[:, -3:] == 255).all()
+
+
+SIDE_BY_SIDE = [pose_at((x, 0.0, 0.0), 0.0, 0.0) for x in (-0.3, 0.0, 0.3)]
+NAMES = ["a/0.png", "a/1.png", "b/2.png"]
+
+
+def _normals(number: int) -> np.ndarray:
+    """Normals (H, W, 3) of the two walls, in the camera's frame, towards it."""
+    rotation, exact = SIDE_BY_SIDE[number].rotation_matrix(), depth_m(SIDE_BY_SIDE[number])
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    rays = bearing_rays(CAMERA, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(*exact.shape, 3)
+    world = SIDE_BY_SIDE[number].inverse().apply((rays * exact[..., None]).reshape(-1, 3))
+    result = np.zeros((exact.size, 3))
+    for origin, along, _, _ in WALLS:
+        normal = np.cross(along, [0.0, 1.0, 0.0])
+        on_wall = np.abs((world - origin) @ normal) < 1e-4
+        result[on_wall] = rotation @ normal
+    result = result.reshape(rays.shape)
+    result[(result * rays).sum(-1) > 0] *= -1
+    return result
+
+
+def write_map(path: Path, array: np.ndarray) -> None:
+    """Write depth (H, W) or normals (H, W, 3) as COLMAP does."""
+    values = np.asarray(array, "<f4")
+    values = values[..., None] if values.ndim == 2 else values
+    height, width, channels = values.shape
+    head = f"{width}&{height}&{channels}&".encode()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(head + np.ascontiguousarray(values.transpose(2, 0, 1)).tobytes())
+
+
+def fuse(root: Path) -> np.ndarray:
+    """Fuse the maps of a workspace by COLMAP; points (N, 3) in the world."""
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels = 2
+    options.num_threads = 1
+    fused = pycolmap.stereo_fusion(
+        str(root / "fused.ply"),
+        str(root),
+        input_type="photometric",
+        options=options,
+        output_type="PLY",
+    )
+    return np.array([point.xyz for point in fused.points3D.values()])
+
+
+def _workspace(root: Path) -> None:
+    exact = depth_m(SIDE_BY_SIDE[1])
+    y, x = np.mgrid[20:280:15, 20:380:15]
+    px = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+    xyz = SIDE_BY_SIDE[1].inverse().apply(bearing_rays(CAMERA, px) * exact[y, x].reshape(-1, 1))
+    rows = np.arange(len(xyz))
+    images = [
+        MapImage(name, CAMERA, pose, project(CAMERA, pose, xyz).astype(np.float32))
+        for name, pose in zip(NAMES, SIDE_BY_SIDE, strict=True)
+    ]
+    pixels = [render(pose) for pose in SIDE_BY_SIDE]
+    write_workspace(root, images, pixels, [(rows, rows)] * 3, xyz)
+    for number, name in enumerate(NAMES):
+        write_map(map_path(root, "depth", name), depth_m(SIDE_BY_SIDE[number]))
+        write_map(map_path(root, "normal", name), _normals(number))
+
+
+def test_colmap_fuses_the_maps_to_the_two_walls(tmp_path: Path) -> None:
+    _workspace(tmp_path)
+    fused = fuse(tmp_path)
+    assert len(fused) > 50_000
+    distances = np.min(
+        [np.abs((fused - o) @ np.cross(along, [0.0, 1.0, 0.0])) for o, along, _, _ in WALLS], axis=0
+    )
+    # its stereo has the centre of the first pixel at (0, 0): half a pixel is 1 cm here
+    assert np.percentile(distances, 99) < 0.012
+
+
+def test_maps_equal_colmap(tmp_path: Path) -> None:
+    exact = depth_m(SIDE_BY_SIDE[0])
+    ours, theirs = tmp_path / "ours.bin", tmp_path / "theirs.bin"
+    write_map(ours, exact)
+    pycolmap.DepthMap.from_array(exact, 1.0, 9.0).write(str(theirs))
+    assert ours.read_bytes() == theirs.read_bytes()
+    np.testing.assert_array_equal(read_map(theirs), exact)
+    normals = _normals(0).astype(np.float32)
+    write_map(ours, normals)
+    np.testing.assert_array_equal(read_map(ours), normals)
+    # as COLMAP's script reads them (pycolmap's NormalMap swaps axes)
+    values = np.frombuffer(ours.read_bytes().split(b"&", 3)[3], np.float32)
+    as_colmap = values.reshape((CAMERA.width, CAMERA.height, 3), order="F").transpose(1, 0, 2)
+    np.testing.assert_array_equal(as_colmap, normals)
+    ours.write_bytes(ours.read_bytes()[:-3])
+    with pytest.raises(DataError, match="ours.bin.*not a map of COLMAP's stereo"):
+        read_map(ours)
+
+
+def test_planes_equal_depth_and_normals() -> None:
+    exact, normals = depth_m(SIDE_BY_SIDE[0]), _normals(0)
+    known = exact > 0
+    planes = planes_of(CAMERA, np.where(known, exact, 1), normals)
+    again = as_estimate(CAMERA, planes, known.astype(float))
+    np.testing.assert_allclose(again.depth_m, exact, rtol=1e-5)
+    inner = known & (np.abs(normals).sum(-1) > 0)
+    assert (again.normals[inner] * normals[inner]).sum(-1).min() > 0.9999
+    # a plane's inverse depth at the next pixel is the wall's
+    same = (normals[:, 1:] == normals[:, :-1]).all(-1) & known[:, 1:] & known[:, :-1]
+    step = planes[:, :-1, 0] + planes[:, :-1, 1]
+    np.testing.assert_allclose(step[same], 1 / exact[:, 1:][same], rtol=1e-4)
+
+
+@pytest.mark.skipif(has_cuda(), reason="this pycolmap has CUDA")
+def test_without_cuda_stereo_is_refused_with_the_remedy() -> None:
+    with pytest.raises(PluginError, match="no CUDA.*pycolmap-cuda12.*sweep"):
+        ColmapStereo()
