@@ -96,19 +96,3 @@ def copy_of(folder: Path, place: Path) -> Path:
     """Copy a folder; links stay links."""
     shutil.copytree(folder, place, symlinks=True)
     return place
-
-
-@pytest.fixture(scope="session")
-def contents() -> Callable[[Path], dict[str, bytes]]:
-    """Function: contents of files and targets of links below a folder, by relative path."""
-
-    def read(root: Path) -> dict[str, bytes]:
-        files = {}
-        for path in sorted(root.rglob("*")):
-            if path.is_symlink():
-                files[str(path.relative_to(root))] = bytes(path.readlink())
-            elif path.is_file():
-                files[str(path.relative_to(root))] = path.read_bytes()
-        return files
-
-    return read

@@ -12,8 +12,8 @@ import pytest
 
 from megloc_kapture.io.images import write_image
 from tests.cli.foreign import DESCRIPTORS, rename_type
+from tests.worlds import folder_bytes
 
-Contents = Callable[[Path], dict[str, bytes]]
 Damage = Callable[[Path], Any]
 
 POSES = "mapping/sensors/trajectories.txt"
@@ -43,14 +43,14 @@ DATASETS: dict[str, tuple[Damage, str]] = {
 
 @pytest.mark.parametrize(("damage", "message"), DATASETS.values(), ids=DATASETS)
 def test_a_damaged_dataset_is_refused(
-    megloc: Any, dataset: Path, contents: Contents, damage: Damage, message: str
+    megloc: Any, dataset: Path, damage: Damage, message: str
 ) -> None:
     damage(dataset)
-    before = contents(dataset)
+    before = folder_bytes(dataset)
     new = dataset.parent / "new"
     megloc("import", "kapture", dataset, "-o", new / "imported").refused(message)
     assert not any(new.glob("*"))
-    assert contents(dataset) == before
+    assert folder_bytes(dataset) == before
 
 
 def test_a_truncated_map_image_is_refused_when_it_is_read(megloc: Any, dataset: Path) -> None:

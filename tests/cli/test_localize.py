@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 import shutil
-from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.io.tables import read_status
 from tests.cli.foreign import DESCRIPTORS, FOREIGN_MAPS, KEYPOINTS, rename_type
+from tests.worlds import folder_bytes
 
 
 def medians(result: Path, truth: Path) -> tuple[float, float, float]:
@@ -37,10 +37,10 @@ def localize(root: Path, output: Path) -> list[str | Path]:
 
 
 def test_a_foreign_map_stays_unchanged_and_a_second_result_replaces_the_first(
-    megloc: Any, foreign: Path, scene: Path, contents: Callable[[Path], dict[str, bytes]]
+    megloc: Any, foreign: Path, scene: Path
 ) -> None:
     rename_type(foreign)
-    before = contents(foreign)
+    before = folder_bytes(foreign)
     times = {path: path.stat().st_mtime_ns for path in foreign.rglob("*")}
     result = foreign.parent / "localized"
     done = megloc(*localize(foreign, result), "--set", "query_pairs.top_k=5")
@@ -48,7 +48,7 @@ def test_a_foreign_map_stays_unchanged_and_a_second_result_replaces_the_first(
     assert re.search(r"^candidates: the 5 of 7 .* by global features AP-GeM-LM18$", done.err, re.M)
     share, median_m, median_deg = medians(result, scene / "query_gt")
     assert share == 1.0 and median_m < 0.01 and median_deg < 0.05
-    assert contents(foreign) == before
+    assert folder_bytes(foreign) == before
     assert {path: path.stat().st_mtime_ns for path in foreign.rglob("*")} == times
     (result / "notes.txt").write_text("mine")
     rejected = (*localize(foreign, result), "--min-confidence", "1")

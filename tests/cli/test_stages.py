@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -19,8 +18,7 @@ from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.preprocessing.masks import FixedMask
-
-Contents = Callable[[Path], dict[str, bytes]]
+from tests.worlds import folder_bytes
 
 OPTIONS = ("--set", "local_features.options.max_keypoints=800")
 INLINE = ("--executor", "inline")
@@ -64,13 +62,11 @@ def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
     return made
 
 
-def test_single_stages_write_the_same_files_as_eval(
-    made: Made, finished: Path, contents: Contents
-) -> None:
+def test_single_stages_write_the_same_files_as_eval(made: Made, finished: Path) -> None:
     def without_marks(folder: Path) -> dict[str, bytes]:
-        return {n: c for n, c in contents(folder).items() if not n.endswith(".megloc")}
+        return {n: c for n, c in folder_bytes(folder).items() if not n.endswith(".megloc")}
 
-    expected = contents(finished)
+    expected = folder_bytes(finished)
 
     def part(*prefixes: str) -> dict[str, bytes]:
         return {n: c for n, c in expected.items() if n.startswith(prefixes)}
@@ -205,14 +201,14 @@ def test_flags_are_converted_to_options() -> None:
 
 
 def test_images_are_resized_and_masked(
-    megloc: Any, scene: Path, camera: str, tmp_path: Path, contents: Callable[[Path], Any]
+    megloc: Any, scene: Path, camera: str, tmp_path: Path
 ) -> None:
-    before = contents(scene / "query")
+    before = folder_bytes(scene / "query")
     out = tmp_path / "new"
     small = ("preprocess", "-i", scene / "query", "-o", out, "--resize", "200", *INLINE)
     done = megloc(*small, "--bottom-share", f"{camera}=0.25")
     assert done.status == 0, done.err
-    assert contents(scene / "query") == before
+    assert folder_bytes(scene / "query") == before
     assert "4 images, 4 of them changed" in done.err
     assert "masked (fixed): 22.22 % of all pixels" in done.err
     new = KaptureFolder(out)

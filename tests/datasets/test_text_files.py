@@ -130,26 +130,24 @@ TRANSFORMATIONS = (
 )
 
 
-@pytest.fixture
-def write(tmp_path: Path) -> Callable[[str], Path]:
-    def write(text: str) -> Path:
-        (tmp_path / "file.txt").write_text(text)
-        return tmp_path / "file.txt"
-
-    return write
+def written(place: Path, text: str) -> Path:
+    (place / "file.txt").write_text(text)
+    return place / "file.txt"
 
 
 @pytest.mark.parametrize("optional", ["", " 0.0 0.0 0.0 0.0", "crop\n800 400\n"])
-def test_a_pinhole_file_has_optional_parts(write: Callable[[str], Path], optional: str) -> None:
+def test_a_pinhole_file_has_optional_parts(tmp_path: Path, optional: str) -> None:
     text = TEXTS[fourseasons.read_pinhole]
-    camera = fourseasons.read_pinhole(write(text.replace(optional, "") if optional else text))
+    camera = fourseasons.read_pinhole(
+        written(tmp_path, text.replace(optional, "") if optional else text)
+    )
     assert camera == Camera("PINHOLE", 800, 400, (501.5, 502.5, 421.8, 167.7))
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_transformations_are_read_in_any_order(write: Callable[[str], Path], order: int) -> None:
+def test_transformations_are_read_in_any_order(tmp_path: Path, order: int) -> None:
     scene_from_slam, earth_from_scene, scale = fourseasons.read_transformations(
-        write("".join(TRANSFORMATIONS[::order]))
+        written(tmp_path, "".join(TRANSFORMATIONS[::order]))
     )
     world_from_scene = RigidTransform((0.8, 0.0, 0.0, 0.6), (4.0, 5.0, 6.0))
     world_from_slam = world_from_scene @ scene_from_slam
@@ -157,7 +155,9 @@ def test_transformations_are_read_in_any_order(write: Callable[[str], Path], ord
     np.testing.assert_allclose(world_from_slam.rotation_matrix(), np.eye(3), atol=1e-12)
     assert earth_from_scene == RigidTransform((0.8, 0.6, 0.0, 0.0), (4e6, 8e5, 4.7e6))
     assert scale == 0.9624
-    _, _, no_scale = fourseasons.read_transformations(write("".join(TRANSFORMATIONS[:4])))
+    _, _, no_scale = fourseasons.read_transformations(
+        written(tmp_path, "".join(TRANSFORMATIONS[:4]))
+    )
     assert no_scale is None
 
 

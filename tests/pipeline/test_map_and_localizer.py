@@ -13,7 +13,6 @@ import pytest
 
 from megloc_kapture import Failure, KaptureMap, Localizer, Pose, Query
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.features.r2d2 import R2D2, R2D2Options
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.kapture import (
@@ -27,7 +26,6 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.pipeline.kapture_map import MapKeypoints
 from megloc_kapture.pipeline.live_source import extract_again
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.options import PipelineOptions
@@ -330,25 +328,3 @@ def test_many_queries_are_localized_lazily_and_in_order(
     for query, found in zip(queries, [first, *results], strict=True):
         assert errors(found, truth.cam_from_world(query.name))[0] < 0.02
     assert read == [query.name for query in queries]
-
-
-@pytest.mark.slow
-def test_our_r2d2_localizes_as_well_as_features_of_the_foreign_map(
-    virtual_gallery: Path, shared_data: Path
-) -> None:
-    weights = str(shared_data / "weights" / "r2d2" / "r2d2_WASF_N16.pt")
-    # as the map was made
-    options = R2D2Options(weights=weights, device="cpu", max_keypoints=500, min_size=600)
-    extractor = R2D2(options)
-    localizer = Localizer(KaptureMap.open(virtual_gallery / "map"))
-    truth = KaptureFolder(virtual_gallery / "query_gt").read().poses()
-    queries = KaptureQueries(KaptureFolder(virtual_gallery / "query"), localizer.map)
-    chosen = [query for query in queries if "00267" in query.name or "00446" in query.name]
-    assert len(chosen) == 2
-    for query in chosen:
-        with_theirs = errors(localizer.localize_query(query), truth[query.name])
-        own = replace(query, features={"r2d2_500": extractor.extract(query.read_image())})
-        with_ours = errors(localizer.localize_query(own), truth[query.name])
-        assert with_ours[0] < 0.02 and with_ours[1] < 0.4, query.name
-        for ours, theirs in zip(with_ours, with_theirs, strict=True):
-            assert ours <= 1.5 * theirs, query.name

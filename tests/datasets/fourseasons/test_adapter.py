@@ -78,6 +78,12 @@ def test_all_frames_are_imported_on_request(root: Path) -> None:
     assert times_of(dataset.mapping) == {A, B, B + 100}
     assert len(dataset.mapping.image_names()) == 6
     assert len(dataset.mapping.poses()) == 4
+    # only those of relocalization pairs are scored
+    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
+    dataset = read(root, frames="all")
+    assert times_of(dataset.query) == {A + 5, B + 5}
+    scored = [name for name in dataset.query.image_names() if dataset.groups[name].scored]
+    assert scored == [image(SNOW, B + 5)]
 
 
 def test_map_and_queries_are_recordings_by_name(root: Path) -> None:
@@ -185,14 +191,6 @@ def test_relocalization_files_select_images_and_priors(
     assert protocol.thresholds == ((0.1, None), (0.2, None), (0.5, None))
     assert dataset.query_gt is None
     assert not dataset.remarks
-
-
-def test_with_all_frames_only_those_of_the_pairs_are_scored(root: Path) -> None:
-    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
-    dataset = read(root, frames="all")
-    assert times_of(dataset.query) == {A + 5, B + 5}
-    scored = [name for name in dataset.query.image_names() if dataset.groups[name].scored]
-    assert scored == [image(SNOW, B + 5)]
 
 
 def test_pairs_of_2020_have_poses_relative_to_poses_txt(root: Path) -> None:
