@@ -23,12 +23,6 @@ from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.stages.work import ordered_map
 
 
-def test_inline_and_one_worker_need_no_pool() -> None:
-    for kind, workers in (("inline", None), ("inline", 8), ("processes", 1)):
-        with open_executor(kind, workers) as executor:  # type: ignore[arg-type]
-            assert executor is None
-
-
 def _log_level() -> int:
     return logging.getLogger().level
 
