@@ -88,15 +88,6 @@ def test_images_take_the_depth_of_their_moment_and_rig(
         np.testing.assert_allclose(record.image_from_depth.translation, [-offset_m, 0, 0])
 
 
-KINDS = ("keypoints", "descriptors")
-
-
-def arrays(folder: KaptureFolder, kind: str) -> dict[str, Any]:
-    """The features of the type ``rootsift`` by image."""
-    reader = getattr(folder, kind)("rootsift")
-    return {image: reader.read(image) for image in reader.names}
-
-
 def test_kapture_reads_the_map(world: Any) -> None:
     theirs = kapture.io.csv.kapture_from_dir(str(world.root / "map"))
     ours = world.map()
@@ -155,8 +146,9 @@ def test_missing_poses_matches_and_depth_are_refused(
 def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_path: Path) -> None:
     # a second type with every other feature
     features = tmp_path / "features"
-    for kind in KINDS:
-        half = {image: rows[::2] for image, rows in arrays(world.map(), kind).items()}
+    for kind in ("keypoints", "descriptors"):
+        whole = getattr(world.map(), kind)("rootsift")
+        half = {image: whole.read(image)[::2] for image in whole.names}
         write_features(features, kind, "half", half)
     reader = world.with_matches("mapping").matches("rootsift")
     with MatchesWriter(features, "half", orphan=True) as writer:

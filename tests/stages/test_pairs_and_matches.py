@@ -141,6 +141,21 @@ def test_map_pairs_by_covisibility_count_points_of_all_types(
     assert of_halves == of_whole != []
 
 
+def test_map_pairs_by_sequence_follow_the_times_of_a_camera(world: Any, tmp_path: Path) -> None:
+    data, images = world.mapping().read(), sorted(world.map_poses)
+    times = dict(zip(images, (0, 1, 5, 1, 3), strict=True))
+    data.sensors["other"] = data.sensors["cam"]
+    data.records_camera = {
+        (time, "other" if image.startswith("right") else "cam"): image
+        for image, time in times.items()
+    }
+    data.trajectories = {key: world.map_poses[image] for key, image in data.records_camera.items()}
+    write_sensors(tmp_path, data)
+    found = paired(KaptureFolder(tmp_path), by=("sequence",), sequence={"window": 1})
+    right = [("right/2.png", "right/4.png"), ("right/3.png", "right/4.png")]
+    assert names(found) == [("left/0.png", "left/1.png"), *right]
+
+
 FRAMES = Restrictions(
     groups={
         image: ImageGroup(frame="a" if k % 2 else "b") for k, image in enumerate(sorted(VECTORS))
