@@ -309,9 +309,7 @@ def test_local_features_are_a_name_or_a_list(
     assert options.main_type() == next(iter(expected))
 
 
-def test_unknown_presets_and_repeated_types_are_refused() -> None:
-    with pytest.raises(OptionError, match="unknown preset 'best'; known: classic, megloc, modern"):
-        options_of_preset("best")
+def test_repeated_types_are_refused() -> None:
     with pytest.raises(OptionError, match="global features 'vlad_rootsift' are listed twice"):
         options_of_preset(assignments=['global_features=["vlad","vlad"]']).retrieval()
     with pytest.raises(OptionError, match="'sift' is listed twice"):
