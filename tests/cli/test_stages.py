@@ -166,11 +166,7 @@ def test_device_and_precision_of_networks_are_chosen_by_flags(
 @pytest.fixture
 def camera(scene: Path) -> str:
     """Id of the scene's camera."""
-    return KaptureFolder(scene / "query").read().record_of(images_of(scene)[0])[1]
-
-
-def images_of(scene: Path) -> list[str]:
-    return KaptureFolder(scene / "query").read().image_names()
+    return KaptureFolder(scene / "query").read().record_of("0001.jpg")[1]
 
 
 def flags(*arguments: str) -> Preprocess:
@@ -213,7 +209,7 @@ def test_images_are_resized_and_masked(
     assert "masked (fixed): 22.22 % of all pixels" in done.err
     new = KaptureFolder(out)
     new.validate(deep=True)
-    image = images_of(scene)[0]
+    image = "0001.jpg"
     assert image_size(new.image_path(image)) == (200, 144)
     mask = read_image_rgb(out / "sensors" / "masks" / f"{image}.png")[..., 0]
     assert mask.shape == (144, 200)

@@ -76,6 +76,8 @@ def synthetic(root: Path) -> Any:
         camera.width, camera.height = 640, 480
         database.update_camera(camera)
     database.close()
+    for number, point in enumerate(made.points3D.values()):
+        point.color = np.array([number, 100, 200], np.uint8)
     made.write_binary(root / "sparse")
     return made
 
