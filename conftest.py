@@ -60,6 +60,18 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def fountain(shared_data: Path) -> Path:
+    """A real scene with surveyed poses: mapping/, query/ and query_gt/; read only."""
+    return shared_data / "scenes" / "fountain_p11"
+
+
+@pytest.fixture(scope="session")
+def virtual_gallery(shared_data: Path) -> Path:
+    """A real map of another tool: map/, query/ and query_gt/; read only."""
+    return shared_data / "foreign_maps" / "virtual_gallery"
+
+
+@pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A rendered scene: mapping/, query/ and query_gt/; not to be written into.
 

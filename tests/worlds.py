@@ -32,6 +32,11 @@ def one_camera(
 
 
 def folder_bytes(folder: Path) -> dict[str, bytes]:
-    """Return the content of every file below a folder, by relative path."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+    """Return the content of files and the targets of links below a folder, by relative path."""
+    return {
+        str(path.relative_to(folder)): bytes(path.readlink())
+        if path.is_symlink()
+        else path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_symlink() or path.is_file()
+    }

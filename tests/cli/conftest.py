@@ -79,12 +79,6 @@ def workspace(finished: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def virtual_gallery(shared_data: Path) -> Path:
-    """A real map of another tool: map/, query/ and query_gt/; read only."""
-    return shared_data / "foreign_maps" / "virtual_gallery"
-
-
-@pytest.fixture(scope="session")
 def foreign_map(finished: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small scene as the map of another tool: map/, query/, query_gt/; read only."""
     root = tmp_path_factory.mktemp("foreign")
@@ -102,19 +96,3 @@ def copy_of(folder: Path, place: Path) -> Path:
     """Copy a folder; links stay links."""
     shutil.copytree(folder, place, symlinks=True)
     return place
-
-
-@pytest.fixture(scope="session")
-def contents() -> Callable[[Path], dict[str, bytes]]:
-    """Function: contents of files and targets of links below a folder, by relative path."""
-
-    def read(root: Path) -> dict[str, bytes]:
-        files = {}
-        for path in sorted(root.rglob("*")):
-            if path.is_symlink():
-                files[str(path.relative_to(root))] = bytes(path.readlink())
-            elif path.is_file():
-                files[str(path.relative_to(root))] = path.read_bytes()
-        return files
-
-    return read

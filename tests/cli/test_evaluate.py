@@ -71,18 +71,6 @@ def results(runs: Path, *names: str) -> list[str | Path]:
     return ["evaluate", *(word for name in names for word in ("-i", runs / name / "localized"))]
 
 
-def test_recall_and_report_of_one_result(megloc: Any, runs: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    done = megloc(*results(runs, "a"), "--gt", runs / "a/query_gt", "-o", out)
-    assert done.status == 0
-    assert "95.0 / 95.0 / 95.0" in done.out  # all but the two lost ones
-    interval = json.loads((out / "recall.json").read_text())["rows"][-1]["recall"][0]
-    assert (interval["low"], interval["high"]) == pytest.approx((0.8308, 0.9939), abs=1e-4)
-    files = {"per_query.csv", "recall.json", "recall.txt", "report.html", "view.html"}
-    assert {path.name for path in out.iterdir() if path.suffix} == files
-    assert "From above" in (out / "report.html").read_text()
-
-
 def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = megloc(*results(runs, "a", "b"), "--gt", runs / "a/query_gt", "-o", out)

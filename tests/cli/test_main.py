@@ -1,22 +1,31 @@
-"""The command itself: help, options, wrong arguments, signals, pipes, shell completion."""
+"""The command itself: help, options, signals, completion; mistakes in arguments and in data."""
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
+import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import megloc_kapture
 from megloc_kapture.cli.info import shown
 from megloc_kapture.cli.main import COMMANDS, main
+from megloc_kapture.io.images import write_image
 from megloc_kapture.pipeline.presets import BASIC_OPTIONS, PRESETS, options_of, options_of_preset
+from megloc_kapture.service import server
 from megloc_kapture.stages.options import PipelineOptions
+from tests.cli.foreign import DESCRIPTORS, rename_type
+from tests.worlds import folder_bytes
 
 WRONG_ARGUMENTS = {
     "unknown command": (["localise"], "unknown command 'localise'; did you mean 'localize'"),
@@ -126,3 +135,115 @@ def test_options_are_listed_by_stage_key_and_plugin(megloc: Any) -> None:
 def test_the_version(megloc: Any) -> None:
     assert megloc("--version").out == f"megloc-kapture {version('megloc-kapture')}\n"
     assert megloc_kapture.__version__ == version("megloc-kapture")
+
+
+@pytest.fixture
+def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that is not refused must not wait for clients."""
+    monkeypatch.setattr(server, "serve", lambda *_, **__: pytest.fail("it is served"))
+
+
+@pytest.mark.usefixtures("no_server")
+def test_a_port_in_use_is_refused_before_the_map_is_read(megloc: Any, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        megloc("serve", tmp_path, "--port", port).refused(f"port {port}: .*in use")
+
+
+@pytest.mark.usefixtures("no_server")
+def test_without_the_extra_the_installation_is_named(
+    megloc: Any, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("megloc_kapture.service")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    line = megloc("serve", finished / "map").refused("uvicorn is not installed")
+    assert line.endswith('pip install "megloc-kapture[serve]"')
+
+
+Damage = Callable[[Path], Any]
+
+POSES = "mapping/sensors/trajectories.txt"
+IMAGE = "mapping/sensors/records_data/0005.jpg"
+
+
+def keep_first_bytes(path: Path, size: int) -> None:
+    path.write_bytes(path.read_bytes()[:size])
+
+
+def pose_without_its_last_column(root: Path) -> None:
+    rows = (root / POSES).read_text().splitlines()
+    rows[3] = rows[3].rpartition(",")[0]
+    (root / POSES).write_text("\n".join(rows) + "\n")
+
+
+def image_of_another_size(root: Path) -> None:
+    write_image(root / IMAGE, np.zeros((100, 200, 3), np.uint8))
+
+
+DATASETS: dict[str, tuple[Damage, str]] = {
+    "missing image": (lambda root: (root / IMAGE).unlink(), r"records_data/0005\.jpg: "),
+    "image of another size": (image_of_another_size, r"records_data/0005\.jpg: .*200x100.*400x300"),
+    "wrong column count": (pose_without_its_last_column, r"mapping/.*trajectories\.txt:4: "),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), DATASETS.values(), ids=DATASETS)
+def test_a_damaged_dataset_is_refused(
+    megloc: Any, dataset: Path, damage: Damage, message: str
+) -> None:
+    damage(dataset)
+    before = folder_bytes(dataset)
+    new = dataset.parent / "new"
+    megloc("import", "kapture", dataset, "-o", new / "imported").refused(message)
+    assert not any(new.glob("*"))
+    assert folder_bytes(dataset) == before
+
+
+def test_a_truncated_map_image_is_refused_when_it_is_read(megloc: Any, dataset: Path) -> None:
+    keep_first_bytes(dataset / IMAGE, 2000)
+    run = ("-w", dataset.parent / "run", "--executor", "inline", "-q")
+    megloc("eval", "kapture", "--root", dataset, *run).refused(r"0005\.jpg: .*broken")
+
+
+def test_localize_and_info_refuse_a_damaged_map(megloc: Any, foreign: Path) -> None:
+    keep_first_bytes(foreign / "map" / DESCRIPTORS / "0000.jpg.desc", 128 * 4 * 799)
+    places = ("-i", foreign / "map", "--query", foreign / "query")
+    message = r"0000\.jpg\.desc: 799 descriptors for 800 keypoints"
+    megloc("localize", *places, "-o", foreign.parent / "localized").refused(message)
+    assert not (foreign.parent / "localized").exists()
+    assert megloc("info", foreign / "map").status == 2
+
+
+def test_missing_features_that_no_plugin_extracts_are_named(megloc: Any, foreign: Path) -> None:
+    rename_type(foreign)
+    output = foreign.parent / "localized"
+    localize = ("localize", "-i", foreign / "map", "--query", foreign / "query", "-o", output)
+    assert "no extractor for orb_800" in megloc("info", foreign / "map").out
+    (foreign / "query/reconstruction/keypoints/orb_800/0001.jpg.kpt").unlink()
+    message = r"image '.*0001\.jpg': features of type 'orb_800' are missing and no extractor"
+    megloc(*localize).refused(message)
+    shutil.rmtree(foreign / "map" / "reconstruction" / "descriptors")
+    megloc(*localize).refused(r"/map: .*'orb_800'", "no extractor")
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "evaluate --gt {}/nowhere -i {}/query_gt",
+        "evaluate --gt {}/query_gt -i {}/nowhere",
+        "submit kapture -i {}/nowhere -o {}/new/poses.txt",
+        "extract-local -i {}/nowhere -o {}/new",
+        "extract-global -i {}/nowhere -o {}/new",
+        "pairs-mapping -i {}/nowhere -o {}/new/pairs.txt",
+        "pairs-query -i {}/mapping --query {}/nowhere -o {}/new/pairs.txt",
+        "match -i {}/nowhere --pairs {}/pairs.txt -o {}/new",
+        "triangulate -i {}/nowhere -o {}/new",
+        "info {}/nowhere",
+    ],
+)
+def test_every_command_names_a_missing_folder(megloc: Any, dataset: Path, command: str) -> None:
+    words = [word.replace("{}", str(dataset)) for word in command.split()]
+    megloc(*words).refused("/nowhere|/mapping")
+    assert not (dataset / "new").exists()

@@ -1,22 +1,29 @@
-"""``megloc map``, ``refine-map`` and ``refine-poses``."""
+"""``megloc map``, ``refine-map``, ``refine-poses``, ``info`` and ``import colmap``."""
 
 from __future__ import annotations
 
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas
 import pytest
+from colmap_workspace import write_workspace
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.service.server import map_overview
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
 
 FEW = ("--set", "local_features.options.max_keypoints=700", "--executor", "inline")
 
@@ -133,3 +140,124 @@ def test_missing_and_unusable_refiners_are_refused(
     megloc(*command).refused("no pose refiner is chosen; give --by: field, icp, rendering")
     megloc(*command, "--by", "field").refused("train-field")
     assert not (tmp_path / "out").exists()
+
+
+def described(out: str) -> dict[str, str]:
+    """Return the first column of each line with the rest of the line."""
+    return dict(re.findall(r"^(\w[\w ]*?)  +(.*)$", out, re.MULTILINE))
+
+
+@pytest.mark.parametrize(
+    ("given", "images", "origin"),
+    [
+        ("foreign_map", 7, "corner"),
+        pytest.param("virtual_gallery", 12, "centre", marks=pytest.mark.slow),
+    ],
+)
+def test_the_content_and_possible_uses_of_a_foreign_map_are_listed(
+    megloc: Any, request: pytest.FixtureRequest, given: str, images: int, origin: str
+) -> None:
+    place = request.getfixturevalue(given) / "map"
+    done = megloc("info", place)
+    assert (done.status, done.err) == (0, "")
+    listed = described(done.out)
+    assert listed["images"] == f"{images} ({images} PINHOLE), {images} with a pose"
+    assert listed["points"] == str(len(KaptureFolder(place).points3d()))
+    assert listed["pixel origin"].startswith(f"{origin}: ")
+    assert listed["map descriptors"] == "present"
+    # R2D2 has an extractor, but its weights are missing
+    assert listed["query features"].startswith(
+        "must be in the query's kapture folder; plugin r2d2 could extract"
+    )
+    assert "megloc weights fetch r2d2_WASF_N16" in listed["query features"]
+    # the few images are all matched; global features of queries need missing weights
+    every = f"all {images} map images"
+    assert listed["retrieval"] == f"{every}, not ranked"
+    ranked = f"if queries have AP-GeM-LM18: {every}, ranked by global features AP-GeM-LM18"
+    assert ranked in done.out
+    errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
+    assert errors is not None
+    of_other, of_origin = sorted(map(float, errors.groups()), reverse=True)
+    assert of_origin < 0.9 * of_other and float(errors[1 + (origin == "centre")]) == of_origin
+
+
+def test_our_own_map_is_checked_completely_on_demand(megloc: Any, finished: Path) -> None:
+    listed = described(megloc("info", finished / "map", "--deep").out)
+    assert listed["checked"] == "all files and images: no fault found"
+    assert listed["pixel origin"].startswith("corner: ")
+    assert listed["query features"].startswith("extracted by plugin rootsift")
+    assert listed["map descriptors"] == "present"
+
+
+def test_a_folder_of_queries_is_no_map_and_may_have_unknown_cameras(
+    megloc: Any, scene: Path, tmp_path: Path
+) -> None:
+    listed = described(megloc("info", scene / "query").out)
+    assert listed["images"] == "4 (4 PINHOLE), 0 with a pose"
+    assert listed["localizing"] == "not possible: no points3d and observations"
+    data = KaptureFolder(scene / "query").read()
+    for name, sensor in data.sensors.items():
+        data.sensors[name] = replace(sensor, params=("UNKNOWN_CAMERA", *sensor.params[1:3]))
+    write_sensors(tmp_path, data)
+    listed = described(megloc("info", tmp_path).out)
+    assert listed["images"].startswith("4 (4 UNKNOWN_CAMERA)")
+    assert listed["missing files"] == f"4 of the images, such as {data.image_names()[0]}"
+
+
+def check(result: Path, scene: Path) -> None:
+    row = evaluate(result, scene / "query_gt").row()
+    assert row.num_localized == row.num_queries > 0
+    assert row.median_position_m is not None and row.median_position_m < 0.01
+
+
+def test_an_imported_model_is_localized_in(
+    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path
+) -> None:
+    done = megloc("import", "colmap", colmap_room, "-o", tmp_path / "map", "--unit", "m")
+    assert done.status == 0 and "observations" in done.out, done
+    assert f"database: {colmap_room}/database.db" in done.err
+    assert "unit              metres" in megloc("info", tmp_path / "map").out
+    queries = ("--query", scene / "query", "-o", tmp_path / "localized")
+    done = megloc("localize", "-i", tmp_path / "map", *queries)
+    assert done.out.startswith("4 of 4 queries localized"), done
+    check(tmp_path / "localized", scene)
+
+
+def test_a_model_is_imported_to_the_cache_where_a_map_is_expected(
+    megloc: Any, colmap_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    model = colmap_room / "sparse" / "0"
+    done = megloc("info", model)
+    assert f"{model}: a COLMAP model, as kapture in {tmp_path}/cache/" in done.err
+    assert "7 (7 PINHOLE), 7 with a pose" in done.out and "extracted by plugin sift" in done.out
+    assert "unit              units of the map" in done.out
+
+
+def test_a_model_of_poses_alone_without_images_is_imported_as_poses(
+    megloc: Any, colmap_room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = pycolmap.Reconstruction(str(colmap_room / "sparse" / "0"))
+    for point in list(model.points3D):
+        model.delete_point3D(point)
+    model.write_text(str(tmp_path))
+    done = megloc("import", "colmap", tmp_path, "-o", tmp_path / "poses")
+    assert done.status == 0 and "kapture folder of poses, not a map" in caplog.text
+    poses = KaptureFolder(tmp_path / "poses").read().poses()
+    for image in model.images.values():
+        expected = image.cam_from_world().matrix()
+        np.testing.assert_allclose(poses[image.name].matrix()[:3], expected, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_model_of_surveyed_photographs_is_localized_in(
+    megloc: Any, shared_data: Path, tmp_path: Path
+) -> None:
+    scene = shared_data / "scenes" / "fountain_p11"
+    write_workspace(tmp_path / "ws", scene)
+    done = megloc("import", "colmap", tmp_path / "ws", "-o", tmp_path / "map")
+    assert done.status == 0, done
+    places = ("-i", tmp_path / "map", "--query", scene / "query", "-o", tmp_path / "localized")
+    done = megloc("localize", *places)
+    assert "localizing with sift" in done.err
+    check(tmp_path / "localized", scene)

@@ -1,22 +1,24 @@
-"""The stages as single commands, followed by localize, evaluate and submit."""
+"""The stages as single commands, preprocessing too, followed by localize and submit."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.io.kapture import read_pairs
+from megloc_kapture.cli.stages import Preprocess
+from megloc_kapture.io.images import image_size, read_image_rgb
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
-
-Contents = Callable[[Path], dict[str, bytes]]
+from megloc_kapture.preprocessing.masks import FixedMask
+from tests.worlds import folder_bytes
 
 OPTIONS = ("--set", "local_features.options.max_keypoints=800")
 INLINE = ("--executor", "inline")
@@ -60,13 +62,11 @@ def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
     return made
 
 
-def test_single_stages_write_the_same_files_as_eval(
-    made: Made, finished: Path, contents: Contents
-) -> None:
+def test_single_stages_write_the_same_files_as_eval(made: Made, finished: Path) -> None:
     def without_marks(folder: Path) -> dict[str, bytes]:
-        return {n: c for n, c in contents(folder).items() if not n.endswith(".megloc")}
+        return {n: c for n, c in folder_bytes(folder).items() if not n.endswith(".megloc")}
 
-    expected = contents(finished)
+    expected = folder_bytes(finished)
 
     def part(*prefixes: str) -> dict[str, bytes]:
         return {n: c for n, c in expected.items() if n.startswith(prefixes)}
@@ -161,3 +161,61 @@ def test_device_and_precision_of_networks_are_chosen_by_flags(
     assert full != half
     run = ["eval", "kapture", "--root", scene, "-w", tmp_path / "run", "-q", "--dry-run"]
     megloc(*run, "--preset", "modern", "--device", "gpu").refused("option device: String should")
+
+
+@pytest.fixture
+def camera(scene: Path) -> str:
+    """Id of the scene's camera."""
+    return KaptureFolder(scene / "query").read().record_of("0001.jpg")[1]
+
+
+def flags(*arguments: str) -> Preprocess:
+    """Return the command with these arguments."""
+    import tyro
+
+    given = ["-i", "in", "-o", "out", *arguments]
+    return tyro.cli(Preprocess, args=given, config=(tyro.conf.OmitArgPrefixes,))
+
+
+def test_flags_are_converted_to_options() -> None:
+    options = flags(
+        *("--resize", "1600", "--undistort", "--set", "upscale=true", "--unchanging"),
+        *("--bottom-share", "rear=0.2", "--bottom-share", "left/a=b*.jpg=0.1"),
+        *("--polygon", "c=0,0.8 1,0.8 1,1", "--mask-file", "c=a/b.png"),
+        *("--segmenter", "deeplab", "--dynamic", "car", "bus", "--user-masks", "m"),
+    ).options()
+    assert (options.max_size_px, options.undistort, options.upscale) == (1600, True, True)
+    assert options.masks.fixed == (
+        FixedMask(camera="rear", bottom_share=0.2),
+        FixedMask(camera="left/a=b*.jpg", bottom_share=0.1),
+        FixedMask(camera="c", polygon=((0, 0.8), (1, 0.8), (1, 1))),
+        FixedMask(camera="c", file=Path("a/b.png")),
+    )
+    masks = options.masks
+    assert masks.segmenter is not None and masks.segmenter.name == "deeplab"
+    assert masks.dynamic == ("car", "bus") and masks.user_masks == Path("m") and masks.unchanging
+
+
+def test_images_are_resized_and_masked(
+    megloc: Any, scene: Path, camera: str, tmp_path: Path
+) -> None:
+    before = folder_bytes(scene / "query")
+    out = tmp_path / "new"
+    small = ("preprocess", "-i", scene / "query", "-o", out, "--resize", "200", *INLINE)
+    done = megloc(*small, "--bottom-share", f"{camera}=0.25")
+    assert done.status == 0, done.err
+    assert folder_bytes(scene / "query") == before
+    assert "4 images, 4 of them changed" in done.err
+    assert "masked (fixed): 22.22 % of all pixels" in done.err
+    new = KaptureFolder(out)
+    new.validate(deep=True)
+    image = "0001.jpg"
+    assert image_size(new.image_path(image)) == (200, 144)
+    mask = read_image_rgb(out / "sensors" / "masks" / f"{image}.png")[..., 0]
+    assert mask.shape == (144, 200)
+    assert set(np.unique(mask)) == {0, 255} and (mask[-30:] == 0).all()
+
+    # a second run without the mask leaves no mask of the first
+    assert megloc(*small).status == 0
+    assert not (out / "sensors" / "masks").exists()
+    assert [p.name for p in sorted(out.iterdir())] == [".megloc", "sensors"]

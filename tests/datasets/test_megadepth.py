@@ -122,16 +122,14 @@ def test_a_scene_is_imported_by_its_table_of_plain_arrays(tmp_path: Path) -> Non
     check(tmp_path / "out" / "0015")
 
 
-def test_missing_scenes_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="neither Undistorted_SfM/SCENE nor scene_info/SCENE.npz"):
-        import_megadepth(tmp_path, tmp_path / "out")
-    with pytest.raises(DataError, match=r"neither .*0001 nor .*0001\.npz exists"):
-        import_megadepth(tmp_path, tmp_path / "out", ("0001",))
-    with pytest.raises(DataError, match="'..'"):
-        import_megadepth(tmp_path, tmp_path / "out", ("..",))
-
-
-def test_a_wrong_table_is_refused(tmp_path: Path) -> None:
+def test_missing_scenes_and_wrong_tables_are_refused(tmp_path: Path) -> None:
+    for scenes, message in (
+        ((), "neither Undistorted_SfM/SCENE nor scene_info/SCENE.npz"),
+        (("0001",), r"neither .*0001 nor .*0001\.npz exists"),
+        (("..",), "'..'"),
+    ):
+        with pytest.raises(DataError, match=message):
+            import_megadepth(tmp_path, tmp_path / "out", scenes)
     (tmp_path / "scene_info").mkdir()
     arrays = {"intrinsics": np.eye(3)[None], "poses": np.eye(4)[None]}
     for path, message in (("x.jpg", "scene 7 has no image with depth"), ("../../x.jpg", "x.jpg")):

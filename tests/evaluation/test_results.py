@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from poses import random_pose
+from scipy.spatial.transform import Rotation
 from scored import write_kapture
 
 from megloc_kapture.errors import DataError

@@ -9,12 +9,6 @@ from kloc import megloc
 
 
 @pytest.fixture(scope="session")
-def fountain(shared_data: Path) -> Path:
-    """The scene: mapping/, query/ and query_gt/."""
-    return shared_data / "scenes" / "fountain_p11"
-
-
-@pytest.fixture(scope="session")
 def fountain_workspace(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the scene with the default preset; tests must not write into it."""
     workspace = tmp_path_factory.mktemp("fountain") / "workspace"

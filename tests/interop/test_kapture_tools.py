@@ -1,18 +1,180 @@
-"""kapture's own console tools read what we write."""
+"""kapture's and kapture-localization's tools on our data, and our stages on theirs."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from kapture.io.csv import kapture_from_dir
-from kloc import kapture_tool
+from kloc import kapture_tool, kloc, merged, needs_kapture_localization, pose_errors, proxy
 
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.stages.image_pairs import QueryPairsOptions, Retrieval, pair_queries
+from megloc_kapture.stages.map_points import triangulate_map
+from megloc_kapture.stages.query_poses import (
+    LocalizationOptions,
+    localize_from_matches,
+    write_localized,
+)
 
 pytestmark = pytest.mark.slow
+
+LOCAL, GLOBAL = "rootsift", "vlad_rootsift"
+
+
+def assert_all_localized(result: Path, truth: Path) -> None:
+    errors = pose_errors(result, truth)
+    assert len(errors) == 4
+    assert all(metres < 0.05 and degrees < 5 for metres, degrees in errors.values()), errors
+
+
+@dataclass(frozen=True)
+class Theirs:
+    """kapture-localization's results from a workspace's features.
+
+    ``together`` is a kapture of links with map and query images, their matches, and our points;
+    the matches are in separate features folders (orphan layout).
+    """
+
+    workspace: Path
+    query_pairs: Path
+    mapping_matches: Path
+    query_matches: Path
+    together: Path
+
+
+@pytest.fixture(scope="module")
+def theirs(
+    fountain: Path, fountain_workspace: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Theirs:
+    """Its compute_image_pairs and compute_matches, run on our features."""
+    folder = tmp_path_factory.mktemp("kapture_localization")
+    features = fountain_workspace / "local_features" / LOCAL
+    vlad = fountain_workspace / "global_features" / GLOBAL / "global_features"
+
+    def linked(name: str, sensors_of: Path) -> Path:
+        matches = folder / f"{name}_matches" / "local_features" / LOCAL / "matches"
+        matches.mkdir(parents=True)
+        data = {
+            f"keypoints/{LOCAL}": features / "keypoints",
+            f"descriptors/{LOCAL}": features / "descriptors",
+            f"global_features/{GLOBAL}": vlad,
+            f"matches/{LOCAL}": matches,
+        }
+        return proxy(folder / name, sensors_of, data)
+
+    mapping, query = linked("mapping", fountain / "mapping"), linked("query", fountain / "query")
+    data = ["keypoints", "descriptors", "global_features", "matches"]
+    sensors = merged(folder / "merged", fountain / "mapping", fountain / "query", skip=data)
+    together = linked("together", sensors)
+    for points in ("points3d.txt", "observations.txt"):
+        ours = fountain_workspace / "map" / "reconstruction" / points
+        (together / "reconstruction" / points).symlink_to(ours)
+
+    pairs_of = {}
+    for image_set, matched in ((mapping, mapping), (query, together)):
+        pairs_of[image_set] = pairs = folder / f"{image_set.name}_pairs.txt"
+        both = ["--mapping", mapping, "--query", image_set]
+        kloc("kapture_compute_image_pairs", *both, "--topk", "7", "-o", pairs)
+        kloc("kapture_compute_matches", "-i", matched, "--pairsfile-path", pairs)
+    return Theirs(
+        workspace=fountain_workspace,
+        query_pairs=pairs_of[query],
+        mapping_matches=folder / "mapping_matches",
+        query_matches=folder / "together_matches",
+        together=together,
+    )
+
+
+@needs_kapture_localization
+def test_pairs_of_both_agree(theirs: Theirs, fountain_workspace: Path) -> None:
+    by_query: dict[str, list[str]] = {}
+    for pair in read_pairs(theirs.query_pairs):
+        by_query.setdefault(pair.query, []).append(pair.map)
+    ours: dict[str, list[str]] = {}
+    for pair in read_pairs(fountain_workspace / "pairs" / "query.txt"):
+        ours.setdefault(pair.query, []).append(pair.map)
+    assert by_query == ours
+
+
+@needs_kapture_localization
+def test_kapture_localization_localizes_in_our_map(
+    theirs: Theirs, fountain: Path, tmp_path: Path
+) -> None:
+    result = tmp_path / "localized"
+    places = ["-i", theirs.together, "--query", fountain / "query", "-o", result]
+    kloc("kapture_pycolmap_localize", *places, "--pairsfile-path", theirs.query_pairs)
+    assert_all_localized(result, fountain / "query_gt")
+
+
+@needs_kapture_localization
+def test_our_stages_run_on_pairs_and_matches_of_kapture_localization(
+    theirs: Theirs, fountain: Path, tmp_path: Path
+) -> None:
+    # these matches are mutual nearest neighbours without verification
+    places = [theirs.workspace, theirs.mapping_matches]
+    mapping = KaptureFolder(fountain / "mapping", features_dirs=places)
+    assert len(mapping.matches(LOCAL).pairs) == 21  # all pairs of 7 images
+    our_map, result = tmp_path / "map", tmp_path / "localized"
+    counts = triangulate_map(mapping, mapping, LOCAL, our_map, TriangulationOptions())
+    assert counts["points"] > 1000
+    options = LocalizationOptions()
+    pairs = read_pairs(theirs.query_pairs)
+    places = [theirs.workspace, theirs.query_matches]
+    query = KaptureFolder(fountain / "query", features_dirs=places)
+    actual = localize_from_matches(KaptureFolder(our_map), query, query, pairs, [LOCAL], options)
+    write_localized(result, query, actual)
+    assert_all_localized(result, fountain / "query_gt")
+
+
+@needs_kapture_localization
+def test_kapture_localization_localizes_in_its_own_map(shared_data: Path, tmp_path: Path) -> None:
+    scene = shared_data / "foreign_maps" / "virtual_gallery"
+    pairs, result = tmp_path / "pairs.txt", tmp_path / "localized"
+    both = ["--mapping", scene / "map", "--query", scene / "query"]
+    kloc("kapture_compute_image_pairs", *both, "--topk", "5", "-o", pairs)
+    everything = merged(tmp_path / "all", scene / "map", scene / "query")
+    kloc("kapture_compute_matches", "-i", everything, "--pairsfile-path", pairs)
+    kloc(
+        "kapture_pycolmap_localize",
+        *("-i", everything, "--query", scene / "query", "--pairsfile-path", pairs, "-o", result),
+        "--write-detailed-report",
+    )
+    errors = pose_errors(result, scene / "query_gt")
+    assert len(errors) == 4
+    # 0.023 m and 0.35 deg at worst with the environment it was written for
+    assert all(metres < 0.03 and degrees < 0.5 for metres, degrees in errors.values()), errors
+
+
+@needs_kapture_localization
+def test_ap_gem_gives_the_pairs_and_scores_of_kapture_localization(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    top_k = 50
+    scene = shared_data / "foreign_maps" / "virtual_gallery"
+    both = ["--mapping", scene / "map", "--query", scene / "query"]
+    path = tmp_path / "pairs.txt"
+    kloc(
+        "kapture_compute_image_pairs",
+        *both,
+        "-gfeat",
+        "AP-GeM-LM18",
+        "--topk",
+        str(top_k),
+        "-o",
+        path,
+    )
+    theirs = read_pairs(path)
+    mapping, query = KaptureFolder(scene / "map"), KaptureFolder(scene / "query")
+    options = QueryPairsOptions(top_k=top_k)
+    ours = pair_queries(mapping, query, options, retrieval=Retrieval(("AP-GeM-LM18",)))
+    assert len(theirs) >= 12
+    assert [(p.query, p.map) for p in ours] == [(p.query, p.map) for p in theirs]
+    assert [p.score for p in ours] == pytest.approx([p.score for p in theirs], rel=0, abs=1e-6)
 
 
 def read_pose_file(path: Path) -> dict[str, np.ndarray]:

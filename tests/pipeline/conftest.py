@@ -12,18 +12,6 @@ from tests.pipeline.runs import evaluated
 
 
 @pytest.fixture(scope="session")
-def fountain(shared_data: Path) -> Path:
-    """A real scene: mapping/, query/ and query_gt/; read only."""
-    return shared_data / "scenes" / "fountain_p11"
-
-
-@pytest.fixture(scope="session")
-def virtual_gallery(shared_data: Path) -> Path:
-    """The foreign map: map/, query/ and query_gt/; read only."""
-    return shared_data / "foreign_maps" / "virtual_gallery"
-
-
-@pytest.fixture(scope="session")
 def workspace(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A workspace with our map of the scene and few keypoints; read only."""
     few = options_of_preset(assignments=["local_features.options.max_keypoints=800"])

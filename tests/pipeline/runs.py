@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture import Failure, Pose
-from megloc_kapture.evaluation.metrics import pose_errors
+from megloc_kapture.geometry.poses import movement
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     TWIN_PREFIX,
@@ -68,10 +68,8 @@ def run_twin(
 
 def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, float]:
     """Return the pose error in metres and degrees."""
-    assert isinstance(found, Pose), found
-    assert truth is not None
-    result = pose_errors({"it": found.cam_from_world}, {"it": truth})
-    return float(result.position_m[0]), float(result.angle_deg[0])
+    assert isinstance(found, Pose) and truth is not None, found
+    return movement(truth, found.cam_from_world)
 
 
 def manifest(stage: str, **changes: Any) -> Manifest:

@@ -26,7 +26,7 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.matches import best_pairs, iterate_candidates
 from megloc_kapture.stages.stage import MAPPING_MATCHES, QUERY_MATCHES, Layout
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated
@@ -143,12 +143,9 @@ def check_second_matches(workspace: Workspace) -> None:
             (row.image, row.other): row for row in read_match_counts(workspace.path(part), TYPE)
         }
         second = {(row.image, row.other): row for row in read_match_counts(again, TYPE)}
-        by_image: dict[str, list[tuple[int, tuple[str, str]]]] = {}
-        for pair, row in first.items():
-            for image in pair if kind == "mapping" else pair[:1]:
-                by_image.setdefault(image, []).append((-row.verified, pair))
-        best = {pair for pairs in by_image.values() for _, pair in sorted(pairs)[:2]}
-        assert set(second) == best and len(best) < len(first)
+        counts = {pair: row.verified for pair, row in first.items()}
+        best = best_pairs(counts, 2, of_both=kind == "mapping")
+        assert set(second) == set(best) and len(best) < len(first)
         # the ratio test removes matches
         assert all(row.matches < first[pair].matches for pair, row in second.items())
         layout = Layout(options_of_preset(assignments=[*FEW, *SECOND]))

@@ -4,32 +4,23 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import chdir
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from distributed import Client
+from distributed import LocalCluster
 from threadpoolctl import threadpool_info
 
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.pipeline import dask_executor
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.stages.work import ordered_map
-
-
-def test_inline_and_one_worker_need_no_pool() -> None:
-    for kind, workers in (("inline", None), ("inline", 8), ("processes", 1)):
-        with open_executor(kind, workers) as executor:  # type: ignore[arg-type]
-            assert executor is None
 
 
 def _log_level() -> int:
@@ -81,43 +72,15 @@ def test_an_error_does_not_wait_for_busy_workers() -> None:
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
 
 
-@contextmanager
-def running(folder: Path, number: int = 2) -> Iterator[str]:
-    """Start a scheduler and workers in another folder; yield the address."""
-    dask = [sys.executable, "-m", "dask"]
-    settings: dict[str, Any] = {"cwd": folder, "text": True, "start_new_session": True}
-    started = [
-        subprocess.Popen(
-            [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"],
-            stderr=subprocess.PIPE,
-            **settings,
-        )
-    ]
-    try:
-        assert started[0].stderr is not None
-        line = next(line for line in started[0].stderr if "Scheduler at:" in line)
-        address = re.findall(r"tcp://\S+", line)[0]
-        worker = [*dask, "worker", address, "--nthreads", "1", "--no-dashboard"]
-        for _ in range(number):
-            started.append(subprocess.Popen(worker, stderr=subprocess.DEVNULL, **settings))
-        with Client(address, set_as_default=False) as client:
-            client.wait_for_workers(number, timeout=60)
-        yield address
-    finally:
-        for process in started:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-
-
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with (
-        running(tmp_path_factory.mktemp("cluster")) as address,
-        pytest.MonkeyPatch.context() as patch,
-    ):
+    """Address of a scheduler whose two workers started in another folder."""
+    with chdir(tmp_path_factory.mktemp("cluster")):
+        running = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    with running, pytest.MonkeyPatch.context() as patch:
         # every process would import torch for its version
         patch.setattr(dask_executor, "_PACKAGES", ["megloc_kapture", "numpy"])
-        yield address
+        yield running.scheduler_address
 
 
 def _slow_square(number: int) -> tuple[int, int]:

@@ -206,16 +206,6 @@ def test_features_with_and_without_pyramid_are_interchangeable(
     assert all(results.values())
 
 
-def test_images_without_stored_features_are_named(workspace: Path, tmp_path: Path) -> None:
-    features = Path(shutil.copytree(workspace / "local_features", tmp_path / "local_features"))
-    name = KaptureFolder(workspace / "query").read().image_names()[2]
-    for suffix in ("kpt", "desc"):
-        (found,) = features.rglob(f"{name}.{suffix}")
-        found.unlink()
-    folder = KaptureFolder(workspace / "query", features_dirs=[tmp_path])
-    assert KaptureQueries(folder, KaptureMap.open(workspace / "map")).lacking("rootsift") == name
-
-
 def test_the_focal_length_of_an_uncalibrated_camera_is_estimated(
     queries: tuple[KaptureMap, KaptureFolder], workspace: Path
 ) -> None:
@@ -262,11 +252,6 @@ def test_cameras_are_scaled_to_smaller_images(
         np.testing.assert_allclose(camera.params, opened.to_colmap(known[name]).params, atol=0.51)
         assert found.data().camera_of(name) == known[name]
     assert "scaled to their images" in caplog.text
-    # an image of another shape fails alone
-    write_image(folder.image_path(names[0]), np.zeros((50, 50, 3), np.uint8))
-    found = KaptureQueries(folder, opened)
-    found.check()
-    assert "50x50, its camera says" in found.unreadable[names[0]]
 
 
 def test_other_spellings_of_a_type_are_recognised(

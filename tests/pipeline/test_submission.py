@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import kapture
 import numpy as np
 import pytest
+from poses import random_pose
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
@@ -30,7 +30,7 @@ from megloc_kapture.io.dataset_tables import (
     write_world,
 )
 from megloc_kapture.io.files import write_json_model
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.tables import write_status
 from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import Run
@@ -54,20 +54,14 @@ FAR = SimilarityTransform(
 )
 
 
-def random_poses(number: int, seed: int = 0) -> list[RigidTransform]:
-    turns = Rotation.random(number, random_state=seed).as_matrix()
-    shifts = np.random.default_rng(seed).normal(size=(number, 3)) * 20
-    return [RigidTransform.from_matrix(r, t) for r, t in zip(turns, shifts, strict=True)]
-
-
 class Dataset:
     """An imported rig of three cameras at four timestamps, and a result for it."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.tables, self.result = root, root / "megloc", root / "localized"
-        offsets = random_poses(3, seed=7)
-        self.rig = dict(zip(SIDES, offsets, strict=True))
-        self.cars = dict(zip((10, 20, 30, 40), random_poses(4), strict=True))
+        rng = np.random.default_rng(0)
+        self.rig = {side: random_pose(rng) for side in SIDES}
+        self.cars = {time: random_pose(rng) for time in (10, 20, 30, 40)}
         self.query = KaptureData(
             sensors=dict.fromkeys(SIDES, CAMERA),
             rigs={"car": self.rig},
@@ -117,9 +111,15 @@ def submit(dataset: Dataset, place: Path, **options: Any) -> tuple[dict[str, int
 
 def test_only_scored_images_are_written(dataset: Dataset, tmp_path: Path) -> None:
     dataset.localize(["dawn/left/10.jpg", "dawn/rear/10.jpg", "night/rear/40.jpg"], {})
+    doubtful = [  # without a pose; only the second is scored
+        LocalizationResult(name=name, confidence=0.3, **FAILED)
+        for name in ("dawn/left/20.jpg", "night/rear/30.jpg")
+    ]
+    write_status(dataset.result / "status.csv", doubtful)
     counts, provenance = submit(dataset, tmp_path / "poses.txt")
     assert list(read_pose_file(tmp_path / "poses.txt")) == ["dawn/rear/10.jpg", "night/rear/40.jpg"]
-    assert counts == NONE | {"queries": 12, "scored": 4, "poses": 2, "missing": 2}
+    expected = {"queries": 12, "scored": 4, "poses": 2, "missing": 2, "doubtful": 1}
+    assert counts == NONE | expected
     assert provenance["counts"] == counts
     assert provenance["missing"] == ["dawn/rear/20.jpg", "night/rear/30.jpg"]
 
@@ -129,7 +129,7 @@ def test_names_with_white_space_are_left_out(
 ) -> None:
     images = ["a b.jpg", "c d/e.jpg", "f.jpg"]
     records = {(time, "rear"): image for time, image in enumerate(images)}
-    poses = dict(zip(records, random_poses(3), strict=True))
+    poses = dict.fromkeys(records, RigidTransform.identity())
     data = KaptureData({"rear": CAMERA}, {}, poses, records)
     write_sensors(tmp_path / "localized", data)
     place = tmp_path / "poses.txt"
@@ -137,18 +137,6 @@ def test_names_with_white_space_are_left_out(
     assert list(read_pose_file(place)) == ["f.jpg"]
     assert (counts["scored"], counts["poses"], counts["missing"]) == (3, 1, 2)
     assert "2 images are left out" in caplog.text and "'a b.jpg'" in caplog.text
-
-
-def test_doubtful_queries_are_counted(dataset: Dataset, tmp_path: Path) -> None:
-    dataset.localize(["dawn/rear/10.jpg"], {})
-    rows = [
-        LocalizationResult(name="dawn/left/10.jpg", confidence=0.3, **FAILED),  # not scored
-        LocalizationResult(name="night/rear/30.jpg", confidence=0.3, **FAILED),
-        LocalizationResult(name="night/rear/40.jpg", **FAILED),  # without a pose
-    ]
-    write_status(dataset.result / "status.csv", rows)
-    counts, _ = submit(dataset, tmp_path / "poses.txt")
-    assert (counts["poses"], counts["missing"], counts["doubtful"]) == (1, 3, 1)
 
 
 def test_the_list_of_names_sets_names_and_order(dataset: Dataset, tmp_path: Path) -> None:
@@ -164,15 +152,6 @@ def test_the_list_of_names_sets_names_and_order(dataset: Dataset, tmp_path: Path
     assert list(found) == list(names.values())
     assert found["rear/30.png"] == dataset.true_pose("night/rear/30.jpg")
     assert (counts["scored"], counts["poses"]) == (3, 3)
-
-
-def test_kapture_reads_poses_in_the_ltvl_format(dataset: Dataset, tmp_path: Path) -> None:
-    dataset.localize(["dawn/rear/10.jpg"], {})
-    submit(dataset, tmp_path / "poses.txt")
-    name, *numbers = (tmp_path / "poses.txt").read_text().split()
-    stored = KaptureFolder(dataset.result).read().poses()[name]
-    theirs = kapture.PoseTransform([float(v) for v in numbers[:4]], [float(v) for v in numbers[4:]])
-    np.testing.assert_allclose(theirs.inverse().t_raw, stored.center(), atol=1e-9)
 
 
 def test_poses_are_written_in_the_official_frame(dataset: Dataset, tmp_path: Path) -> None:
@@ -241,7 +220,8 @@ DUMMY = "0.0 0.0 0.0 0.0 0.0 0.0 1.0"
 
 def write_drives(root: Path) -> KaptureData:
     """Write a map, localized queries and relocalization pairs of 4Seasons; return both drives."""
-    poses = random_poses(7)
+    rng = np.random.default_rng(0)
+    poses = [random_pose(rng) for _ in STAMPS]
 
     def drive(numbers: range, posed: range) -> KaptureData:
         folder = "ref" if numbers.start == 0 else "test"
@@ -400,57 +380,46 @@ def test_labels_name_features_that_differ_from_the_preset(tmp_path: Path) -> Non
     )
 
 
-NAME = "Aachen_v1_1_eval_megloc-classic"
+NAME, FOLDER = "Aachen_v1_1_eval_megloc-classic", "4Seasons_eval_megloc-1.5"
 
 
-def pose_file(run: Path, text: str, **provenance: str) -> Path:
-    place = run / "submissions" / f"{NAME}.txt"
-    place.parent.mkdir(parents=True, exist_ok=True)
-    place.write_text(text)
-    write_provenance(place, provenance, counts={})
+def pose_file(run: Path, text: str, *, folder: bool = False) -> Path:
+    """Write a pose file, or a folder of two, with its provenance."""
+    place = run / "submissions" / (FOLDER if folder else f"{NAME}.txt")
+    files = [place / "a.txt", place / "b.txt"] if folder else [place]
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    names = [file.name for file in files] if folder else None
+    write_provenance(place, {"preset": text}, counts={}, files=names)
     return place
 
 
-def pose_files(run: Path, texts: dict[str, str]) -> Path:
-    place = run / "submissions" / "4Seasons_eval_megloc-1.5"
-    place.mkdir(parents=True)
-    for name, text in texts.items():
-        (place / name).write_text(text)
-    write_provenance(place, {}, counts={}, files=list(texts))
-    return place
+def contents(place: Path) -> dict[str, bytes]:
+    return folder_bytes(place) if place.is_dir() else {"": place.read_bytes()}
 
 
-def test_different_pose_files_get_numbers_and_equal_ones_are_reused(tmp_path: Path) -> None:
-    folder, texts = tmp_path / "kept", ("first\n", "second\n", "third\n")
-    places = [pose_file(tmp_path / text.strip(), text, preset=text) for text in texts]
-    names = [f"{NAME}.txt", f"{NAME}-2.txt", f"{NAME}-3.txt"]
-    kept = [keep_submission(place, folder) for place in places]
-    assert kept == [folder / name for name in names]
-    assert kept[0].with_name(f"{NAME}.txt.json").read_bytes() == (
-        places[0].with_name(f"{NAME}.txt.json").read_bytes()
-    )
-    for place, text in zip(kept, texts, strict=True):
+@pytest.mark.parametrize("folder", [False, True])
+def test_different_pose_files_get_numbers_and_equal_ones_are_reused(
+    tmp_path: Path, folder: bool
+) -> None:
+    out, texts = tmp_path / "kept", ("first", "second", "third")
+    places = [pose_file(tmp_path / text, text, folder=folder) for text in texts]
+    kept = [keep_submission(place, out) for place in places]
+    name = FOLDER if folder else NAME
+    found = [place.name.removesuffix(".txt") for place in kept]
+    assert found == [name, f"{name}-2", f"{name}-3"]
+    for place, source, text in zip(kept, places, texts, strict=True):
+        assert contents(place) == contents(source)
         provenance = json.loads(place.with_name(f"{place.name}.json").read_text())
-        assert place.read_text() == text
-        assert list(provenance["files"]) == [place.name] and provenance["preset"] == text
-    before = folder_bytes(folder)
+        names = ["a.txt", "b.txt"] if folder else [place.name]
+        assert list(provenance["files"]) == names and provenance["preset"] == text
+    before = folder_bytes(out)
     # the provenance of the first run stays
-    again = pose_file(tmp_path / "again", "second\n", preset="another")
+    again = pose_file(tmp_path / "again", "second", folder=folder)
     for place, expected in zip([*reversed(places), again], [*kept[::-1], kept[1]], strict=True):
-        assert keep_submission(place, folder) == expected
-    assert folder_bytes(folder) == before
-
-
-def test_a_challenge_of_several_files_is_a_folder(tmp_path: Path) -> None:
-    folder = tmp_path / "kept"
-    first = pose_files(tmp_path / "1", {"a.txt": "1 2\n", "b.txt": "3 4\n"})
-    other = pose_files(tmp_path / "2", {"a.txt": "1 2\n", "b.txt": "5 6\n"})
-    fewer = pose_files(tmp_path / "3", {"a.txt": "1 2\n"})
-    names = [keep_submission(place, folder).name for place in (fewer, first, other, first)]
-    assert names == [f"4Seasons_eval_megloc-1.5{end}" for end in ("", "-2", "-3", "-2")]
-    for place, name in zip((fewer, first, other), names, strict=False):
-        assert folder_bytes(folder / name) == folder_bytes(place)
-        assert (folder / f"{name}.json").read_bytes() == Path(f"{place}.json").read_bytes()
+        assert keep_submission(place, out) == expected
+    assert folder_bytes(out) == before
 
 
 def test_a_missing_pose_file_is_refused(tmp_path: Path) -> None:

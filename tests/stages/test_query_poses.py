@@ -1,8 +1,9 @@
-"""Queries localized from stored matches, and the folder of their results."""
+"""Queries localized from stored matches, refined poses, and the folder of their results."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,26 +11,34 @@ import kapture.io.csv
 import numpy as np
 import pandas
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import error_vector
 
+from megloc_kapture.errors import PluginError
+from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
+from megloc_kapture.io.dataset_tables import ImageGroup
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
+    CONSISTENCY_FILE,
     COVARIANCE_FILE,
     POSES_FILE,
     STATUS_FILE,
+    read_consistency,
     read_covariances,
+    read_refinement,
     read_status,
 )
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import ClusterOptions
 from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatches
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import POSE_RANKERS, PoseHypothesis, RankingScene
+from megloc_kapture.plugins import POSE_RANKERS, PoseHypothesis, PoseRefinement, RankingScene
+from megloc_kapture.refinement.references import Displacement
+from megloc_kapture.stages.image_pairs import Restrictions
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
     localize_query,
@@ -39,6 +48,7 @@ from megloc_kapture.stages.query_poses import (
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from tests.worlds import folder_bytes
 
 
 def test_queries_are_localized_accurately(world: Any) -> None:
@@ -51,29 +61,13 @@ def test_queries_are_localized_accurately(world: Any) -> None:
         assert error_m < 0.005 and error_deg < 0.05
         assert result.num_inliers > 100 and set(result.seconds) >= {"reading", "estimation"}
         assert set(result.candidates) <= set(world.map_poses)
-        delta = truth @ result.cam_from_world.inverse()
-        vector = Rotation.from_matrix(delta.rotation_matrix()).as_rotvec()
-        error = np.concatenate([vector, delta.translation])
+        error = error_vector(result.cam_from_world, truth)
         # six degrees of freedom, with room for errors of the map
         assert error @ np.linalg.solve(result.covariance, error) < 100
     with open_executor("processes", 2) as executor:
         in_processes = world.localized(work=Work(executor))
     for a, b in zip(results, in_processes, strict=True):
         assert (a.cam_from_world, a.num_inliers) == (b.cam_from_world, b.num_inliers)
-
-
-def test_a_query_without_candidates_fails(world: Any) -> None:
-    only_b = [ImagePair("query/b.png", "right/2.png", 1.0)]
-    first, second = world.localized(only_b)
-    assert first == Failure("no map image is a candidate")
-    assert isinstance(second, Pose) and second.candidates == ("right/2.png",)
-
-
-def test_a_query_with_too_few_inliers_fails_and_keeps_its_counts(world: Any) -> None:
-    for result in world.localized(pose=AbsolutePoseOptions(min_inliers=5000)):
-        assert isinstance(result, Failure)
-        assert "at least 5000 are needed" in result.reason
-        assert result.num_matches > 100 and result.candidates
 
 
 class Brightness:
@@ -214,27 +208,167 @@ def test_localized_queries_are_written_as_kapture_and_tables(world: Any, tmp_pat
     assert {line.split(",")[1] for line in lines[1:]} >= {"reading", "estimation", "refinement"}
 
 
-@pytest.mark.parametrize(
-    ("fallback", "retrieved", "has_fallback"),
-    [("none", True, False), ("retrieval", False, False), ("retrieval", True, True)],
-)
-def test_a_failed_query_has_no_pose_without_a_fallback(
-    world: Any, tmp_path: Path, fallback: Any, retrieved: bool, has_fallback: bool
+COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 1 / 3])
+SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
+
+
+class Shift:
+    """Moves every pose by 0.25 along the optical axis, but not that of image ``stays``."""
+
+    def __init__(self, stays: str = "", name: str = "shift") -> None:
+        self.stays, self.name = stays, name
+        self.asked: dict[str, list[str]] = {}
+
+    def refine(
+        self,
+        query: str,
+        camera: Camera,
+        cam_from_world: RigidTransform,
+        references: Sequence[str],
+        scene: Any,
+    ) -> Any:
+        self.asked[query] = list(references)
+        assert scene.query_image(query).shape[:2] == (camera.height, camera.width)
+        if self.name == "wrong":
+            return None
+        if query == self.stays:
+            return PoseRefinement(cam_from_world, "nothing overlaps", {"overlap": 0.125})
+        return PoseRefinement(SHIFT @ cam_from_world, measures={"overlap": 0.5})
+
+
+class Sure(Shift):
+    """Moves poses in frames whose map is consistent; FRAMES has the inconsistency."""
+
+    def __init__(self, require_consistent_map: bool = True) -> None:
+        super().__init__(name="sure")
+        self.require_consistent_map = require_consistent_map
+
+    def hold_out(self, image: str, images: Any, scene: Any) -> Displacement | None:
+        assert scene.map_pose(image) is not None and image in images.names
+        off = FRAMES["good" if int(image.removesuffix(".png")) < 6 else "bad"]
+        return Displacement(0.02, 0.2, 3.0, 0.001, 0.01, off)
+
+
+# frame of a map image: standardised error of held-out map images
+FRAMES = {"good": 1.0, "bad": 1e4}
+
+
+class Chosen(PoseRefinementOptions):
+    """Options with given refiners."""
+
+    refiners: tuple[Any, ...] = ()
+
+    def make_refiners(self, placement: Any = None) -> list[Any]:
+        return list(self.refiners)
+
+
+def status_table(localized: Path) -> pandas.DataFrame:
+    return pandas.read_csv(localized / "status.csv", index_col="image", keep_default_na=False)
+
+
+@pytest.fixture
+def localized(world: Any, tmp_path: Path) -> KaptureFolder:
+    """One query at its true pose, from the map's first image; the other failed."""
+    first, second = sorted(world.query_poses)
+    image = min(world.map_poses)
+    pose = world.query_poses[first]
+    found = Pose(pose, 50, 40, name=first, candidates=(image,), covariance=COVARIANCE)
+    folder = tmp_path / "localized"
+    write_localized(folder, world.query(), [found, Failure("too dark", name=second)])
+    return KaptureFolder(folder)
+
+
+def test_refiners_are_applied_in_order_and_failures_stay(
+    world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
-    fallback_pose = world.map_poses["left/1.png"]
-    first, second = world.localized()
-    results = [Failure("no map image matches", name=first.name), second]
-    counts = write_localized(
-        tmp_path, world.query(), results, fallback=fallback,
-        first_candidates={q: ("left/1.png", fallback_pose) for q in world.query_poses if retrieved},
-    )  # fmt: skip
-    assert counts == {"queries": 2, "localized": 1, "failed": 1, "fallbacks": int(has_fallback)}
-    written = KaptureFolder(tmp_path).read()
-    assert written.image_names() == sorted(world.query_poses)
-    assert written.poses().get("query/a.png") == (fallback_pose if has_fallback else None)
-    assert written.poses()["query/b.png"] != fallback_pose
-    status = read_status(tmp_path / STATUS_FILE)
-    a, b = status["query/a.png"], status["query/b.png"]
-    assert (a.status, a.reason, a.num_inliers) == ("failed", "no map image matches", 0)
-    assert a.fallback == ("retrieval" if has_fallback else "none")
-    assert (b.status, b.fallback) == ("localized", "none")
+    first, second = sorted(world.query_poses)
+    options = Chosen(refiners=(Shift(), Shift(stays=first), Shift()))
+    arguments = world.mapping(), world.query(), localized
+    counts = refine_poses(*arguments, tmp_path / "out", options)
+    assert counts["queries"] == 1
+    refined = KaptureFolder(tmp_path / "out").read().poses()
+    expected = SHIFT @ SHIFT @ world.query_poses[first]
+    assert refined.keys() == {first}
+    np.testing.assert_allclose(refined[first].translation, expected.translation)
+    status = status_table(tmp_path / "out")
+    steps = "shift: accepted; shift: nothing overlaps; shift: accepted"
+    assert status.refinement[first] == steps
+    assert (status.refinement[second], status.reason[second]) == ("", "too dark")
+    steps = read_refinement(tmp_path / "out" / "refinement.csv", refined)[first]
+    assert [step.accepted for step in steps] == [True, False, True]
+    assert [step.moved_m for step in steps] == pytest.approx([0.25, 0, 0.25])
+    assert steps[1].measures == {"overlap": 0.125}
+    assert localized.read().poses()[first] == world.query_poses[first]
+    with ThreadPoolExecutor(2) as executor:
+        refine_poses(*arguments, tmp_path / "threads", options, work=Work(executor))
+    assert folder_bytes(tmp_path / "out") == folder_bytes(tmp_path / "threads")
+
+
+def test_rejected_refinements_keep_the_covariance(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    first = min(world.query_poses)
+    kept = {}
+    for name, stays in (("stays", first), ("moved", "")):
+        options = Chosen(refiners=(Shift(stays=stays),))
+        refine_poses(world.mapping(), world.query(), localized, tmp_path / name, options)
+        kept[name] = read_covariances(tmp_path / name / "covariance.csv")
+    np.testing.assert_array_equal(kept["stays"][first], COVARIANCE)
+    assert kept["moved"] == {}  # the refiner returns no covariance
+    # the references are the candidates of the pose
+    assert options.refiners[0].asked[first] == [min(world.map_poses)]
+
+
+def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_path: Path) -> None:
+    wrong = Chosen(refiners=(Shift(name="wrong"),))
+    with pytest.raises(PluginError, match="'wrong' on image .*: refine returned NoneType"):
+        refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
+
+
+@pytest.fixture
+def folders(world: Any, small_kapture: Any, tmp_path: Path) -> tuple[KaptureFolder, ...]:
+    """A map of two frames, and two localized queries, one in each."""
+    image = next(iter(world.mapping().read().image_names()))
+    pixels = read_image_rgb(world.mapping().image_path(image))
+    pose = RigidTransform.identity()
+    names = [f"{k:02d}.png" for k in range(12)]
+    mapping = small_kapture(
+        {name: pixels for name in names}, name="map", poses={name: pose for name in names}
+    )
+    query = small_kapture({"a.png": pixels, "b.png": pixels}, name="query")
+    found = [
+        Pose(pose, 50, 40, name=q, candidates=(first,))
+        for q, first in (("a.png", "00.png"), ("b.png", "06.png"))
+    ]
+    write_localized(tmp_path / "localized", query, found)
+    return mapping, query, KaptureFolder(tmp_path / "localized")
+
+
+RESTRICTIONS = Restrictions(
+    groups={f"{k:02d}.png": ImageGroup(frame="good" if k < 6 else "bad") for k in range(12)}
+)
+
+
+def test_each_coordinate_frame_has_its_consistency(folders: Any, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = Chosen(refiners=(Sure(),))
+    counts = refine_poses(*folders, out, options, restrictions=RESTRICTIONS)
+    assert counts == {
+        "queries": 2, "accepted_by_sure": 1, "frames_where_sure_is_trusted": 1,
+    }  # fmt: skip
+    text = status_table(out).refinement
+    assert text["a.png"] == "sure: accepted"
+    assert "sure: the map contradicts itself: 6 of 6" in text["b.png"]
+    (first,), (second,) = read_refinement(out / "refinement.csv", {}).values()
+    assert (first.accepted, second.accepted) == (True, False) and second.reason in text["b.png"]
+    poses = KaptureFolder(out).read().poses()
+    assert poses["a.png"] == SHIFT and poses["b.png"] == RigidTransform.identity()
+    bad, good = read_consistency(out / CONSISTENCY_FILE)
+    assert (bad.frame, bad.images, bad.contradicting) == ("bad", 6, 6)
+    assert (good.frame, good.contradicting, good.reason) == ("good", 0, "")
+    assert consistency_sentence(good).startswith("sure in good is used; 6 map images held out")
+    # without the check the refiner is used everywhere
+    options = Chosen(refiners=(Sure(require_consistent_map=False),))
+    counts = refine_poses(*folders, tmp_path / "all", options, restrictions=RESTRICTIONS)
+    assert counts == {"queries": 2, "accepted_by_sure": 2}
+    assert not (tmp_path / "all" / CONSISTENCY_FILE).exists()

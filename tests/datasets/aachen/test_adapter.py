@@ -1,9 +1,11 @@
-"""Aachen Day-Night in its official layout, on small layouts written by hand."""
+"""Aachen Day-Night in small official layouts, and in kapture folders made of them by kapture."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,20 +24,24 @@ from aachen_files import (
 )
 from kapture import flatten
 from kapture.io.csv import kapture_from_dir
+from kapture_forms import (
+    aachen_with_kapture,
+    assert_linked,
+    assert_same_dataset,
+    without_images,
+)
+from kloc import kapture_tool
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.pipeline.datasets import choose_dataset
+from megloc_kapture.values import Camera
 
 QUERY_CAMERA = Camera("SIMPLE_RADIAL", 8, 6, (7.5, 4.0, 3.0, -0.0353019))
-POSES = {
-    "db/7.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (-2.0, 0.0, 5.0)),
-    "db/1228.jpg": RigidTransform((0.0, 0.0, 0.0, 1.0), (1.0, 2.0, -3.0)),
-    "db/3.jpg": RigidTransform((0.5, 0.5, 0.5, 0.5), (40.0, -700.0, 8.0)),
-}
 
 
 def edit(path: str, old: str, new: str) -> Callable[[Path], None]:
@@ -68,21 +74,12 @@ def written(root: Path, output: Path, *, allow_missing: bool = False, **options:
     return output
 
 
-def assert_poses(data: KaptureData) -> None:
-    poses = data.poses()
-    for name, pose in POSES.items():
-        np.testing.assert_allclose(poses[name].matrix(), pose.matrix(), rtol=0, atol=1e-9)
-
-
 def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     out = written(root, tmp_path / "out")
     mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
-    assert mapping.poses().keys() == POSES.keys()
-    assert_poses(mapping)
+    assert mapping.poses().keys() == set(DATABASE)
     # the list has the cameras by name
-    assert mapping.camera_of("db/7.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (10.5, 4, 3, -0.08))
     assert mapping.camera_of("db/3.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (12, 4.25, 3, -0.25))
-    assert mapping.camera_of("db/1228.jpg") == Camera("SIMPLE_RADIAL", 6, 8, (11, 3, 4, 0.5))
     assert [mapping.record_of(name) for name in DATABASE] == [
         (position, f"camera_{position:05d}") for position in range(3)
     ]
@@ -93,27 +90,6 @@ def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     records = [(100_000 + k, f"day_{k:05d}") for k in range(3)] + [(200_000, "night_00000")]
     assert [query.record_of(name) for name in (*DAY, *NIGHT)] == records
     assert not (out / "query_gt").exists()
-    for part, name in (("mapping", "db/7.jpg"), ("query", NIGHT[0])):
-        assert KaptureFolder(out / part).image_path(name).samefile(root / "images_upright" / name)
-
-
-def test_version_1_1_is_read(root11: Path, tmp_path: Path) -> None:
-    out = written(root11, tmp_path / "out")
-    mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
-    assert mapping.poses().keys() == {*DATABASE, *SEQUENCE}
-    assert_poses(mapping)
-    assert mapping.poses()[SEQUENCE[0]].translation == (0, 0, 1)
-    # three cameras took five images
-    cameras = dict(zip((*DATABASE, *SEQUENCE), (9, 2, 9, 5, 5), strict=True))
-    for name, camera_id in cameras.items():
-        assert mapping.record_of(name)[1] == f"camera_{camera_id:05d}"
-    assert len({timestamp for timestamp, _ in mapping.records_camera}) == 5
-    assert mapping.camera_of(SEQUENCE[0]) == Camera("PINHOLE", 8, 6, (9.123456789012345, 9, 4, 3))
-    assert query.image_names() == sorted(DAY + NIGHT + ADDED)
-    theirs = kapture_from_dir(str(out / "mapping"))
-    assert (len(theirs.records_camera.data_list()), len(theirs.sensors)) == (5, 3)
-    assert all(pose.r is not None for *_, pose in flatten(theirs.trajectories))
-    assert len(kapture_from_dir(str(out / "query")).records_camera.data_list()) == 5
 
 
 def test_tables_have_the_names_conditions_and_protocol_of_the_challenge(
@@ -195,13 +171,7 @@ def test_the_model_of_the_chosen_version_is_required(root: Path) -> None:
 def test_the_reference_model_is_imported_on_request(root: Path, tmp_path: Path) -> None:
     assert not (written(root, tmp_path / "plain") / "reference").exists()
     output = written(root, tmp_path / "out", reference_model=True) / "reference"
-    theirs = kapture_from_dir(str(output))
-    assert theirs.points3d is not None and theirs.observations is not None
-    points = [[2, 0, 5, 255, 0, 9], [1, 1, 1, 1, 2, 3]]
-    np.testing.assert_array_equal(theirs.points3d.as_array(), points)
-    seen = [{image for image, _ in theirs.observations[point, "sift"]} for point in (0, 1)]
-    assert seen == [{"db/7.jpg", "db/3.jpg"}, {"db/3.jpg", "db/1228.jpg"}]
-    assert theirs.descriptors is None
+    assert not KaptureFolder(output).types("descriptors")
     for database in (None, root / "aachen.db"):
         if database is not None:
             database.touch()
@@ -209,3 +179,118 @@ def test_the_reference_model_is_imported_on_request(root: Path, tmp_path: Path) 
         assert dataset.reference is not None and dataset.reference_database == database
         told = any("without descriptors" in remark for remark in dataset.remarks)
         assert told == (database is None)
+
+
+PARTS = ("query_day", "query_night")
+
+
+@pytest.fixture(scope="module")
+def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_v1_1(write_v1_0(tmp_path_factory.mktemp("official") / "Aachen"))
+
+
+@pytest.fixture(scope="module")
+def kapture_form(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The layout of kapture's downloader: mapping/, query_day/ and query_night/."""
+    return aachen_with_kapture(official, tmp_path_factory.mktemp("kapture") / "Aachen-Day-Night")
+
+
+@pytest.fixture
+def form_copy(kapture_form: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(kapture_form, tmp_path / "form", symlinks=True))
+
+
+def test_both_forms_give_the_same_dataset(
+    official: Path, kapture_form: Path, tmp_path: Path
+) -> None:
+    expected, actual = read(official), read(kapture_form)
+    assert len(expected.names) == 5 and expected.protocol.pose_file_stem == "Aachen_v1_1"
+    assert_same_dataset(actual, expected)
+    assert_linked(actual, tmp_path / "out", official / "images_upright")
+    assert kapture_from_dir(str(tmp_path / "out" / "query")).trajectories is None
+
+
+def test_queries_merged_by_kapture_are_read(
+    official: Path, kapture_form: Path, form_copy: Path
+) -> None:
+    parts = [kapture_form / part for part in PARTS]
+    images = ["--image_transfer", "link_absolute"]
+    kapture_tool("kapture_merge", "-i", *parts, "-o", form_copy / "query", *images)
+    assert_same_dataset(read(form_copy), read(official))  # the layout of kapture's scripts
+    for part in PARTS:
+        shutil.rmtree(form_copy / part)
+    assert_same_dataset(read(form_copy), read(official))
+
+
+def test_kapture_folders_may_be_in_a_subfolder(
+    official: Path, kapture_form: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "Aachen-Day-Night-v1.1"  # the name in kapture's archive
+    place.mkdir()
+    (place / "kapture").symlink_to(kapture_form)
+    assert_same_dataset(read(place), read(official))
+    monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
+    choice = choose_dataset("aachen", None)
+    choice.check()
+    assert choice.root == place
+    # official files take precedence
+    shutil.copytree(official, place, dirs_exist_ok=True)
+    assert read(place).links == {"": place / "images_upright"}
+
+
+def test_the_name_of_the_pose_file_follows_the_version(kapture_form: Path, form_copy: Path) -> None:
+    for part, gone in (("mapping", "sequences/"), ("query_night", "_additional_night/")):
+        without_images(form_copy / part, gone)
+    assert read(form_copy).protocol.pose_file_stem == "Aachen"
+    # the additional queries alone, or the name of the folder, show version 1.1
+    shutil.rmtree(form_copy / "query_night")
+    shutil.copytree(kapture_form / "query_night", form_copy / "query_night", symlinks=True)
+    assert read(form_copy).protocol.pose_file_stem == "Aachen_v1_1"
+    shutil.rmtree(form_copy / "query_night")
+    assert read(form_copy, version="1.1").protocol.pose_file_stem == "Aachen_v1_1"
+    named = form_copy.rename(form_copy.with_name("Aachen-Day-Night-v1.1"))
+    assert read(named).protocol.pose_file_stem == "Aachen_v1_1"
+
+
+def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
+    """Return cameras and poses by image, as kapture reads them."""
+    data = kapture_from_dir(str(folder))
+    poses = data.trajectories or {}
+    return {
+        name: (data.sensors[sensor].camera_params, poses.get(time, {}).get(sensor))
+        for time, sensor, name in flatten(data.records_camera)
+    }
+
+
+def assert_same_kapture(ours: Path, theirs: Path) -> None:
+    actual, expected = images_of(ours), images_of(theirs)
+    assert actual.keys() == expected.keys() and len(actual) > 2
+    for name, (params, pose) in expected.items():
+        our_params, our_pose = actual[name]
+        assert our_params == params and (our_pose is None) == (pose is None)
+        if pose is not None:
+            np.testing.assert_allclose(our_pose.t_raw, pose.t_raw, rtol=0, atol=1e-9)
+            turns = (Rotation.from_quat(p.r_raw, scalar_first=True) for p in (our_pose, pose))
+            assert np.degrees((next(turns) * next(turns).inv()).magnitude()) < 1e-9
+
+
+@pytest.fixture
+def sample(shared_data: Path) -> Path:
+    folder = shared_data / "kapture_samples" / "Aachen-Day-Night"
+    if not folder.is_dir():
+        pytest.skip(f"no sample at {folder}")
+    return folder
+
+
+@pytest.mark.slow
+def test_kapture_imports_the_published_sample_equally(sample: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write_official(read(sample), out, allow_missing=True)
+    assert_same_kapture(out / "mapping", sample / "kapture/training")
+    assert_same_kapture(out / "query", sample / "kapture/query")
+    kapture_tool(
+        "kapture_import_nvm",
+        *("-i", sample / MODEL, "-im", sample / "images_upright"),
+        *("-o", tmp_path / "theirs", "--image_transfer", "skip"),
+    )
+    assert_same_kapture(out / "mapping", tmp_path / "theirs")

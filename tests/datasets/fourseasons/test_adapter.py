@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 from fourseasons_files import (
     DAY,
@@ -44,54 +43,6 @@ def root(tmp_path: Path) -> Path:
     return write_two_recordings(tmp_path / "root")
 
 
-def test_official_poses_apply_scale_and_transformations(root: Path) -> None:
-    """Expected values by hand: scale of the row, S_AS, inverse of w_gpsw, e_gpsw."""
-    dataset = read(root)
-    turn = Rotation.from_euler("x", 90, degrees=True) * Rotation.from_euler("z", 90, degrees=True)
-    for timestamp, center in (
-        # (2, 0, 0) * 0.5 -> (0, 1, 0) -> (-10, -19, -30) -> (-10, 30, -19)
-        (A, (3999990.0, 800030.0, 4699981.0)),
-        # (2, 4, 0) * 0.25 -> (-1, 0.5, 0) -> (-11, -19.5, -30) -> (-11, 30, -19.5)
-        (B, (3999989.0, 800030.0, 4699980.5)),
-    ):
-        pose = official(dataset, image(DAY, timestamp))
-        np.testing.assert_allclose(pose.center(), center, atol=1e-8)
-        np.testing.assert_allclose(pose.rotation_matrix().T, turn.as_matrix(), atol=1e-12)
-    # the local frame is the scene's, east, north and up, moved by whole metres
-    first, second = (pose_of(dataset, image(DAY, t)).center() for t in (A, B))
-    assert np.linalg.norm(first) < 2
-    np.testing.assert_allclose(second - first, [-1, -0.5, 0], atol=1e-9)
-    np.testing.assert_allclose(first - np.round(first), 0, atol=1e-9)
-
-
-def test_the_right_camera_is_at_the_right(root: Path) -> None:
-    """A point 0.3 m right of the left camera's axis lies on the right camera's axis."""
-    dataset = read(root)
-    left, right = (pose_of(dataset, image(DAY, A, c)) for c in ("cam0", "cam1"))
-    point = right.apply(left.inverse().apply(np.array([[0.3, 0.0, 5.0]])))
-    np.testing.assert_allclose(point, [[0.0, 0.0, 5.0]], atol=1e-9)
-    camera = dataset.mapping.camera_of(image(DAY, A, "cam1"))
-    colmap = pycolmap.Camera(model=camera.model, width=8, height=4, params=list(camera.params))
-    np.testing.assert_allclose(colmap.img_from_cam(point), [[4.25, 1.75]], atol=1e-9)
-
-
-def test_other_recordings_have_other_transformations(root: Path) -> None:
-    """Two SLAM worlds with the same ECEF position."""
-    folder = write_recording(root, RAIN, (A + 9,), (f"{A + 9} 3 0 0 0 0 0 1 2.0 2",))
-    write(
-        folder / "Transformations.txt",
-        "# transform_S_AS: t, q\n0,0,0,0,0,0,1\n\n"
-        "# transform_w_gpsw: t, q\n1,1,1,0,0,0,1\n\n"
-        "# transform_e_gpsw: t, q\n3999985,800031,4699982,0,0,0,1\n",
-    )
-    dataset = read(root, queries=RAIN)
-    pose, right = (pose_of(dataset, image(RAIN, A + 9, c)) for c in ("cam0", "cam1"))
-    # (3, 0, 0) * 2 -> (5, -1, -1) -> the position of the first keyframe of the map
-    same = pose_of(dataset, image(DAY, A))
-    np.testing.assert_allclose(pose.center(), same.center(), atol=1e-8)
-    np.testing.assert_allclose((right @ pose.inverse()).translation, (-0.3, 0, 0), atol=1e-12)
-
-
 def test_kapture_reads_the_written_rig_and_integer_times(root: Path, tmp_path: Path) -> None:
     write_official(read(root), tmp_path / "out")
     theirs = kapture_from_dir(str(tmp_path / "out/mapping"))
@@ -127,6 +78,12 @@ def test_all_frames_are_imported_on_request(root: Path) -> None:
     assert times_of(dataset.mapping) == {A, B, B + 100}
     assert len(dataset.mapping.image_names()) == 6
     assert len(dataset.mapping.poses()) == 4
+    # only those of relocalization pairs are scored
+    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
+    dataset = read(root, frames="all")
+    assert times_of(dataset.query) == {A + 5, B + 5}
+    scored = [name for name in dataset.query.image_names() if dataset.groups[name].scored]
+    assert scored == [image(SNOW, B + 5)]
 
 
 def test_map_and_queries_are_recordings_by_name(root: Path) -> None:
@@ -234,14 +191,6 @@ def test_relocalization_files_select_images_and_priors(
     assert protocol.thresholds == ((0.1, None), (0.2, None), (0.5, None))
     assert dataset.query_gt is None
     assert not dataset.remarks
-
-
-def test_with_all_frames_only_those_of_the_pairs_are_scored(root: Path) -> None:
-    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
-    dataset = read(root, frames="all")
-    assert times_of(dataset.query) == {A + 5, B + 5}
-    scored = [name for name in dataset.query.image_names() if dataset.groups[name].scored]
-    assert scored == [image(SNOW, B + 5)]
 
 
 def test_pairs_of_2020_have_poses_relative_to_poses_txt(root: Path) -> None:

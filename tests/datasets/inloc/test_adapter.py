@@ -1,28 +1,23 @@
-"""InLoc, on a small download written by hand: a scanner in a box, on two floors."""
+"""InLoc, on a small download written by hand: a scan on each of two floors."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
-import kapture
 import numpy as np
 import pytest
-from inloc_files import CENTRES, HEIGHT, SCANS, VIEWS, WIDTH, Floats, scanned, write_download
-from kapture.io.csv import kapture_from_dir
+from inloc_files import write_download
 from PIL import Image
 
 from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
+from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import DATASETS
 from megloc_kapture.values import Camera
-
-import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 
 @pytest.fixture(scope="module")
@@ -46,62 +41,20 @@ def output(downloaded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return imported(downloaded, tmp_path_factory.mktemp("imported") / "out")
 
 
-def in_cutouts(mapping: Path, sensor_type: str) -> dict[str, tuple[Floats, Any]]:
-    """Return the scanned points in the frame of each record's sensor, and its COLMAP camera.
-
-    kapture reads and composes the poses.
-    """
-    theirs = kapture_from_dir(str(mapping))
-    poses = kapture.rigs_remove(theirs.trajectories, theirs.rigs) if theirs.rigs else None
-    records = theirs.records_camera if sensor_type == "camera" else theirs.records_depth
-    result = {}
-    for timestamp, sensor_id, name in kapture.flatten(records):
-        model, width, height, *params = theirs.sensors[sensor_id].sensor_params
-        numbers = {"width": int(width), "height": int(height), "params": list(map(float, params))}
-        *_, floor, _, file = name.split("/")
-        yaw, pitch = (int(part) for part in file.split(".")[0].split("_")[-2:])
-        rotation, translation = SCANS[floor]
-        in_floor = scanned(yaw, pitch).reshape(-1, 3) @ rotation.T + translation
-        in_camera = (poses or theirs.trajectories)[timestamp, sensor_id].transform_points(in_floor)
-        camera = pycolmap.Camera(model=model, **numbers)
-        result[name] = in_camera.reshape(HEIGHT, WIDTH, 3), camera
-    return result
-
-
-def test_scanned_points_project_into_their_pixels(output: Path) -> None:
-    cutouts = in_cutouts(output / "mapping", "camera")
-    assert sorted(cutouts) == sorted(
-        f"database/cutouts/{floor}/024/DUC_cutout_024_{yaw}_{pitch}.jpg"
-        for floor in SCANS
-        for yaw, pitch in VIEWS
-    )
-    for points, camera in cutouts.values():
-        seen = np.isfinite(points).all(axis=2)
-        assert seen.sum() == WIDTH * HEIGHT - 2
-        assert (points[seen][:, 2] > 0.5).all()
-        np.testing.assert_allclose(camera.img_from_cam(points[seen]), CENTRES[seen], atol=1e-6)
-
-
-@pytest.mark.parametrize("step", [1, 3])
-def test_depth_maps_hold_the_scanned_depth(
-    downloaded: Path, output: Path, tmp_path: Path, step: int
-) -> None:
-    if step != 1:
-        output = imported(downloaded, tmp_path / "out", depth_step=step)
-    cutouts = in_cutouts(output / "mapping", "depth")
-    assert len(cutouts) == 72
-    for name, (points, camera) in cutouts.items():
-        kept = points[::step, ::step]
-        path = output / "mapping" / "sensors" / "records_data" / name
-        depth = np.frombuffer(path.read_bytes(), "<f4").reshape(kept.shape[:2])
-        assert (camera.width, camera.height) == depth.shape[::-1]
-        known = np.isfinite(kept).all(axis=2)
-        assert (depth[~known] == 0).all() and (~known).any()
-        np.testing.assert_allclose(depth[known], kept[known][:, 2], rtol=1e-6)
-        rows, columns = np.nonzero(known)
-        pixels = np.column_stack([columns, rows]) + 0.5
-        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(rows))])
-        np.testing.assert_allclose(rays * depth[known][:, None], kept[known], atol=1e-5)
+def test_depth_maps_may_be_thinned(downloaded: Path, output: Path, tmp_path: Path) -> None:
+    cameras, depths = [], []
+    for place in (output, imported(downloaded, tmp_path / "out", depth_step=3)):
+        folder = KaptureFolder(place / "mapping")
+        (_, sensor), name = next(iter(folder.read().records_depth.items()))
+        camera = folder.read().sensors[sensor].camera()
+        size = {"width": camera.width, "height": camera.height}
+        cameras.append(camera)
+        depths.append(read_depth_map(folder.depth_path(name), **size))
+    np.testing.assert_array_equal(depths[1], depths[0][::3, ::3])
+    # a pixel of the thinned map is one of the whole map
+    pixels = np.array([[0.5, 0.5], [1.5, 2.5]]), np.array([[0.5, 0.5], [3.5, 6.5]])
+    thinned, whole = map(bearing_rays, cameras[::-1], pixels)
+    np.testing.assert_allclose(thinned, whole, atol=1e-12)
 
 
 def test_cameras_have_the_focal_lengths_of_the_paper(root: Path) -> None:
@@ -145,19 +98,6 @@ def test_each_floor_is_a_coordinate_frame(output: Path) -> None:
     assert {groups[i].frame for i in KaptureFolder(output / "query").read().image_names()} == {""}
     assert read_protocol(output / "megloc").conditions == ("DUC1", "DUC2")
     assert not (output / "query_gt").exists()
-
-
-def test_depth_sensors_share_a_rig_with_the_cameras_and_are_optional(downloaded: Path) -> None:
-    data = read(downloaded).mapping
-    assert list(data.rigs) == ["cutout_40x30_rig"]
-    assert {device for _, device in data.trajectories} == {"cutout_40x30_rig"}
-    assert len({timestamp for timestamp, _ in data.records_camera}) == 72
-    adapter = load_plugin(DATASETS, "inloc", {"depth": False})
-    assert isinstance(adapter, InLoc)
-    without = adapter.read(downloaded).mapping
-    assert not without.rigs and not without.records_depth
-    for image, pose in data.poses().items():
-        np.testing.assert_allclose(without.poses()[image].matrix(), pose.matrix(), atol=1e-12)
 
 
 def test_distractor_floors_are_imported_on_request(root: Path) -> None:

@@ -1,4 +1,4 @@
-"""Text files of the datasets: harmless variants are read, mistakes are named with file and line."""
+"""Text files of the datasets: variants and optional parts are read, mistakes are named."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
 from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.text_lines import read_camera_rows, read_transform
-from megloc_kapture.values import Camera
+from megloc_kapture.values import Camera, RigidTransform
 
 Reader = Callable[[Path], Any]
 TIME = 1602074877390449152
@@ -63,23 +63,8 @@ def test_line_ends_and_blanks_do_not_matter(tmp_path: Path, reader: Reader) -> N
         assert repr(reader(path)) == expected, other
 
 
-def test_images_with_cameras_are_read_in_their_order(tmp_path: Path) -> None:
-    path = tmp_path / "list.txt"
-    path.write_text(TEXTS[read_camera_rows])
-    assert list(read_camera_rows(path).items()) == [
-        ("query/day/a.jpg", Camera("SIMPLE_RADIAL", 1600, 1200, (1469.2, 800, 600, -0.0353))),
-        ("query/b.jpg", Camera("PINHOLE", 768, 1024, (971.838, 971.838, 384, 512))),
-    ]
-
-
-def test_a_transform_is_read_with_any_separator_and_numbers_of_scans_are_read(
-    tmp_path: Path,
-) -> None:
+def test_numbers_of_wrong_scans_are_read(tmp_path: Path) -> None:
     path = tmp_path / "file.txt"
-    for separator in (" ", ",", " , "):
-        path.write_text(MATRIX.replace(" ", separator))
-        moved = read_transform(path).apply(np.array([[1.0, 0, 0]]))
-        np.testing.assert_allclose(moved, [[5, 3, -0.1]], atol=1e-15)
     path.write_text(TEXTS[read_wrong_scans])
     assert read_wrong_scans(path) == {"008", "012", "031"}
 
@@ -134,3 +119,53 @@ def test_a_wrong_row_is_named(
     with pytest.raises(DataError, match=message) as caught:
         reader(path)
     assert (caught.value.path, caught.value.line) == (path, line)
+
+
+TRANSFORMATIONS = (
+    "# transform_S_AS: translation vector, rotation quaternion\n1,2,3,0,0,0,1\n",
+    "# TS_cam_imu: translation vector, rotation quaternion\n9,9,9,0,0,0,1\n",
+    "# transform_w_gpsw: translation vector, rotation quaternion\n4,5,6,0,0,0.6,0.8\n",
+    "# transform_e_gpsw: translation vector, rotation quaternion\n4e6,8e5,4.7e6,0.6,0,0,0.8\n",
+    "# GNSS scale\n0.9624\n",
+)
+
+
+def written(place: Path, text: str) -> Path:
+    (place / "file.txt").write_text(text)
+    return place / "file.txt"
+
+
+@pytest.mark.parametrize("optional", ["", " 0.0 0.0 0.0 0.0", "crop\n800 400\n"])
+def test_a_pinhole_file_has_optional_parts(tmp_path: Path, optional: str) -> None:
+    text = TEXTS[fourseasons.read_pinhole]
+    camera = fourseasons.read_pinhole(
+        written(tmp_path, text.replace(optional, "") if optional else text)
+    )
+    assert camera == Camera("PINHOLE", 800, 400, (501.5, 502.5, 421.8, 167.7))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_transformations_are_read_in_any_order(tmp_path: Path, order: int) -> None:
+    scene_from_slam, earth_from_scene, scale = fourseasons.read_transformations(
+        written(tmp_path, "".join(TRANSFORMATIONS[::order]))
+    )
+    world_from_scene = RigidTransform((0.8, 0.0, 0.0, 0.6), (4.0, 5.0, 6.0))
+    world_from_slam = world_from_scene @ scene_from_slam
+    np.testing.assert_allclose(world_from_slam.translation, (1.0, 2.0, 3.0), atol=1e-12)
+    np.testing.assert_allclose(world_from_slam.rotation_matrix(), np.eye(3), atol=1e-12)
+    assert earth_from_scene == RigidTransform((0.8, 0.6, 0.0, 0.0), (4e6, 8e5, 4.7e6))
+    assert scale == 0.9624
+    _, _, no_scale = fourseasons.read_transformations(
+        written(tmp_path, "".join(TRANSFORMATIONS[:4]))
+    )
+    assert no_scale is None
+
+
+def test_names_of_images_have_condition_camera_and_time() -> None:
+    key = robotcar.ImageKey("night-rain", "rear", "1418840689734892")
+    for name in ("night-rain/rear/1418840689734892.png", "./night-rain/rear/1418840689734892.jpg"):
+        assert robotcar.parse_image(name) == key
+    assert (key.timestamp, key.path) == (1418840689734892, "night-rain/rear/1418840689734892")
+    assert robotcar.parse_image("rear/5.png") == robotcar.ImageKey("", "rear", "5")
+    for name in ("5.png", "a/b/rear/5.png", "../rear/5.png", "dawn/rear/5.jpeg", "dawn/rear/x.jpg"):
+        assert robotcar.parse_image(name) is None, name

@@ -1,4 +1,4 @@
-"""Triangulated and lifted maps: accurate, complete and read by kapture."""
+"""Triangulated and lifted maps, and maps whose points move to features extracted again."""
 
 from __future__ import annotations
 
@@ -13,14 +13,28 @@ from corner import CAMERA, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.colmap import TriangulationOptions
+from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
+    FeatureConfig,
+    FeatureWriter,
     ImagePair,
     KaptureFolder,
     MatchesWriter,
+    Observations,
+    write_observations,
+    write_points3d,
     write_sensors,
 )
+from megloc_kapture.stages.global_features import extract_vlad, read_vocabulary
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.map_features import (
+    copy_features,
+    move_points,
+    rows_at_their_places,
+    rows_found_again,
+)
 from megloc_kapture.stages.map_points import lift_map, triangulate_map
 from megloc_kapture.stages.scene import depth_records, index_map
 from megloc_kapture.values import RigidTransform
@@ -72,44 +86,6 @@ def test_images_take_the_depth_of_their_moment_and_rig(
     for image, record in records.items():
         assert (record.path, record.camera) == (f"{image}.depth", CAMERA)
         np.testing.assert_allclose(record.image_from_depth.translation, [-offset_m, 0, 0])
-
-
-def test_points_lie_on_the_walls(world: Any, distance_to_walls: Any) -> None:
-    distance = distance_to_walls(world.map().points3d()[:, :3])
-    assert len(distance) > 300
-    assert np.median(distance) < 0.005
-    assert (distance < 0.05).mean() > 0.98
-
-
-KINDS = ("keypoints", "descriptors")
-
-
-def arrays(folder: KaptureFolder, kind: str) -> dict[str, Any]:
-    """The features of the type ``rootsift`` by image."""
-    reader = getattr(folder, kind)("rootsift")
-    return {image: reader.read(image) for image in reader.names}
-
-
-def test_the_map_contains_everything_for_localization(world: Any) -> None:
-    folder = KaptureFolder(world.root / "map")
-    folder.validate(deep=True)
-    assert folder.read().poses().keys() == world.map_poses.keys()
-    ours, given = folder.read(), world.mapping().read()
-    assert ours.sensors == given.sensors and ours.trajectories == given.trajectories
-    for kind in KINDS:
-        features, extracted = arrays(folder, kind), arrays(world.mapping(), kind)
-        assert features.keys() == world.map_poses.keys()  # without the queries
-        for image, array in features.items():
-            np.testing.assert_array_equal(array, extracted[image])
-    # features and images are links
-    file = "keypoints/left/0.png.kpt"
-    linked = folder.root / "reconstruction" / file.replace("/", "/rootsift/", 1)
-    assert linked.samefile(world.features_dir / "local_features" / "rootsift" / file)
-    link, source = (one.root / "sensors" / "records_data" for one in (folder, world.mapping()))
-    assert link.is_symlink() and link.resolve() == source.resolve()
-    assert folder.global_features("vlad_rootsift").names == sorted(world.map_poses)
-    place = world.root / "map" / "reconstruction" / "global_features" / "vlad_rootsift"
-    assert (place / "vocabulary.npy").is_file() and (place / "vlad.json").is_file()
 
 
 def test_kapture_reads_the_map(world: Any) -> None:
@@ -174,8 +150,9 @@ def test_missing_poses_matches_and_depth_are_refused(
 def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_path: Path) -> None:
     # a second type with every other feature
     features = tmp_path / "features"
-    for kind in KINDS:
-        half = {image: rows[::2] for image, rows in arrays(world.map(), kind).items()}
+    for kind in ("keypoints", "descriptors"):
+        whole = getattr(world.map(), kind)("rootsift")
+        half = {image: whole.read(image)[::2] for image in whole.names}
         write_features(features, kind, "half", half)
     reader = world.with_matches("mapping").matches("rootsift")
     with MatchesWriter(features, "half", orphan=True) as writer:
@@ -192,14 +169,135 @@ def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_pat
     found.validate(deep=True)
     points = np.concatenate([first.points3d(), second.points3d()])
     np.testing.assert_array_equal(found.points3d(), points)
-    assert observed(found, "rootsift") == observed(first, "rootsift")
-    assert observed(found, "half", len(first.points3d())) == observed(second, "half")
+    assert observations_of(found, "rootsift") == observations_of(first, "rootsift")
+    assert observations_of(found, "half", len(first.points3d())) == observations_of(second, "half")
     assert counts["points_half"] == len(second.points3d()) > 30
     assert counts["observations_half"] == half_counts["observations"] and counts["pairs"] == 20
 
 
-def observed(folder: KaptureFolder, name: str, offset: int = 0) -> list[Any]:
+def observations_of(folder: KaptureFolder, name: str, offset: int = 0) -> list[Any]:
     """Return the image names, points, image rows and keypoints of a type."""
     seen = folder.observations()[name]
     columns = seen.point_ids - offset, seen.image_ids, seen.keypoint_ids
     return [seen.image_names, *(column.tolist() for column in columns)]
+
+
+TYPE = "rootsift"
+
+
+def published(source: KaptureFolder, root: Path) -> KaptureFolder:
+    """Write a map without descriptors: only observed keypoints, in another order."""
+    seen = source.observations()[TYPE]
+    write_sensors(root, source.read())
+    link_images(source.root, root)
+    write_points3d(root, source.points3d())
+    numbers = np.zeros(len(seen), np.int32)
+    rng = np.random.default_rng(0)
+    config = FeatureConfig("published", np.dtype(np.float32), 2)
+    with FeatureWriter(root, "keypoints", TYPE, config) as writer:
+        for row, image in enumerate(seen.image_names):
+            here = np.flatnonzero(seen.image_ids == row)
+            used = rng.permutation(np.unique(seen.keypoint_ids[here]))
+            for number, keypoint in enumerate(used.tolist()):
+                numbers[here[seen.keypoint_ids[here] == keypoint]] = number
+            writer.write(image, source.keypoints(TYPE).read(image)[used, :2])
+    again = Observations(TYPE, seen.image_names, seen.point_ids, seen.image_ids, numbers)
+    write_observations(root, {TYPE: again})
+    return KaptureFolder(root)
+
+
+def observed(folder: KaptureFolder) -> set[tuple[tuple[float, ...], str, tuple[float, ...]]]:
+    """Return the point, image and keypoint coordinates of every observation."""
+    seen, points = folder.observations()[TYPE], folder.points3d()
+    found = set()
+    for row, image in enumerate(seen.image_names):
+        keypoints = folder.keypoints(TYPE).read(image)
+        rows = seen.image_ids == row
+        for point, keypoint in zip(seen.point_ids[rows], seen.keypoint_ids[rows], strict=True):
+            found.add((tuple(points[point].tolist()), image, tuple(keypoints[keypoint].tolist())))
+    return found
+
+
+def test_the_vocabulary_and_its_whitening_are_copied(world: Any, tmp_path: Path) -> None:
+    options = VladOptions(num_clusters=8, dimensions=3)
+    extract_vlad(world.mapping(), [world.mapping()], TYPE, tmp_path, options)
+    copy_features(world.mapping().with_features([tmp_path]), tmp_path / "map")
+    copy = read_vocabulary(tmp_path / "map/reconstruction/global_features/vlad_rootsift")
+    assert copy is not None and copy[0].size == 3 and copy[1].options == options
+
+
+def test_observations_move_to_extracted_features(world: Any, tmp_path: Path) -> None:
+    truth, reference = world.map(), published(world.map(), tmp_path / "reference")
+    counts = move_points(reference, world.mapping(), TYPE, tmp_path / "map")
+    made = KaptureFolder(tmp_path / "map")
+    made.validate()
+    assert counts["share_found_again"] == 1.0
+    np.testing.assert_array_equal(made.points3d(), truth.points3d())
+    # further keypoints at almost equal coordinates are other orientations
+    assert observed(made) >= observed(truth)
+    assert len(observed(made)) < 1.01 * len(observed(truth))
+    for image in made.descriptors(TYPE).names:
+        stored, extracted = (
+            np.hstack([folder.keypoints(TYPE).read(image), folder.descriptors(TYPE).read(image)])
+            for folder in (made, truth)
+        )
+        # observed keypoints only, as they were extracted
+        assert set(map(tuple, stored)) < set(map(tuple, extracted))
+
+
+def test_observations_without_a_feature_are_left_out(
+    world: Any, write_features: Any, tmp_path: Path
+) -> None:
+    truth, reference = world.map(), published(world.map(), tmp_path / "reference")
+    for kind in ("keypoints", "descriptors"):
+        reader = getattr(world.mapping(), kind)(TYPE)
+        first = {image: reader.read(image)[:600] for image in reader.names}
+        write_features(tmp_path / "features", kind, TYPE, first)
+    some = world.mapping().with_features([tmp_path / "features"])
+    counts = move_points(reference, some, TYPE, tmp_path / "map")
+    made = KaptureFolder(tmp_path / "map")
+    made.validate()
+    keypoints = some.keypoints(TYPE)
+    kept = {name: set(map(tuple, keypoints.read(name).tolist())) for name in keypoints.names}
+    expected = {row for row in observed(truth) if row[2] in kept[row[1]]}
+    assert observed(made) >= expected and len(observed(made)) < 1.05 * len(expected)
+    share = len(expected) / len(observed(truth))
+    assert counts["share_found_again"] == pytest.approx(share, abs=0.02) and 0.5 < share < 1
+    # points without observations are removed and the others numbered again
+    points = made.points3d()
+    assert counts["points"] == len(points) < len(truth.points3d())
+    assert set(made.observations()[TYPE].point_ids.tolist()) == set(range(len(points)))
+
+
+NONE = np.zeros((0, 2), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("stored", "extracted", "rows"),
+    [
+        ([(1, 1), (5, 5), (9, 9)], [(9, 9.01), (1, 1), (7, 7), (20, 20)], [1, -1, 0]),
+        # keypoints at equal coordinates are joined in order
+        ([(1, 1), (1, 1), (2, 2), (1, 1)], [(2, 2), (1, 1), (3, 3), (1, 1)], [1, 3, 0, -1]),
+        ([(1, 1)], NONE, [-1]),
+    ],
+)
+def test_keypoints_are_found_by_coordinates(stored: Any, extracted: Any, rows: list[int]) -> None:
+    found = rows_found_again(*(np.array(one, np.float32) for one in (stored, extracted)))
+    assert found.dtype == np.int64 and found.tolist() == rows
+
+
+def at_places(stored: Any, extracted: Any, shift: float) -> list[tuple[int, int]]:
+    arrays = (np.array(one, np.float32) for one in (stored, extracted))
+    of, rows = rows_at_their_places(*arrays, shift)
+    assert of.dtype == rows.dtype == np.int64
+    return list(zip(of.tolist(), rows.tolist(), strict=True))
+
+
+def test_all_orientations_of_the_nearest_keypoint_are_found() -> None:
+    stored = [(1, 1), (30, 30), (9, 9)]
+    extracted = [(9, 9), (1.3, 1), (9.05, 9), (1.9, 1), (1.3, 1.02)]
+    # (1.9, 1) is within the limit, but is another keypoint
+    assert at_places(stored, extracted, 1.0) == [(0, 1), (0, 4), (2, 0), (2, 2)]
+    assert at_places(stored, extracted, 0.2) == [(2, 0), (2, 2)]
+    assert at_places([(30, 30)], extracted, 0.2) == []
+    assert at_places([(1, 1)], NONE, 1.0) == []

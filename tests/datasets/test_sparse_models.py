@@ -1,7 +1,8 @@
-"""NVM with every quirk of the published files, compared with kapture's own importer."""
+"""Sparse models: NVM compared with kapture's importer, and which files of COLMAP are read."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,24 @@ import kapture.io.csv
 import numpy as np
 import pytest
 from kapture.io.records import TransferAction
-from megloc_twins.sparse_models import write_nvm
+from megloc_twins.sparse_models import write_colmap_model, write_nvm
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets import nvm as nvm_reader
 from megloc_kapture.datasets.nvm import NvmModel, read_nvm
-from megloc_kapture.io.colmap_model import SparsePoints
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    SparsePoints,
+    colmap_model_files,
+    read_colmap_model,
+)
 from megloc_kapture.io.images import write_image
+from megloc_kapture.values import Camera, RigidTransform
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
 
 SAMPLE = "kapture_samples/Aachen-Day-Night"
 
@@ -182,3 +194,91 @@ def test_a_written_model_reads_back_equal_and_kapture_reads_it(tmp_path: Path) -
         write_image(tmp_path / "images" / name, np.zeros((48, 64, 3), np.uint8))
     data = import_with_kapture(path, tmp_path / "images", tmp_path / "kapture")
     check_against_kapture(model, data, tmp_path / "kapture")
+
+
+EMPTY = ColmapModel({}, (), SparsePoints.none())
+POSE = RigidTransform((0.5, 0.5, -0.5, 0.5), (0.1, -2e-17, 3e9))
+SMALL = ColmapModel(
+    {3: Camera("PINHOLE", 640, 480, (500.0, 501.0, 320.0, 240.0))},
+    (ColmapImage(2**31 - 2, "a/b/c.jpg", 3, POSE),),
+    SparsePoints.none(),
+)
+
+
+def test_binary_files_take_precedence_over_text_and_poses_need_no_points(tmp_path: Path) -> None:
+    for read in (read_colmap_model, colmap_model_files):
+        with pytest.raises(DataError, match="neither images.bin nor images.txt is here") as caught:
+            read(tmp_path)
+        assert str(caught.value).startswith(f"{tmp_path}: ")
+    write_colmap_model(tmp_path, EMPTY, text=True)
+    names = ("cameras.txt", "images.txt", "points3D.txt")
+    assert colmap_model_files(tmp_path) == tuple(tmp_path / name for name in names)
+    assert read_colmap_model(tmp_path).images == ()
+    write_colmap_model(tmp_path, SMALL, text=False)
+    (tmp_path / "points3D.bin").unlink()
+    poses = read_colmap_model(tmp_path, with_points=False)
+    assert (poses.cameras, poses.images, len(poses.points)) == (SMALL.cameras, SMALL.images, 0)
+    with pytest.raises(DataError, match=r"points3D\.bin: file is missing"):
+        read_colmap_model(tmp_path)
+    names = ("cameras.bin", "images.bin")
+    assert colmap_model_files(tmp_path, with_points=False) == tuple(tmp_path / n for n in names)
+
+
+CAMERAS = "1 SIMPLE_RADIAL 1600 1067 1084.6 800 533.5 -0.0811\n"
+IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n\n8 1 0 0 0 0 0 0 1 db/8.jpg\n\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("cameras", "SIMPLE_RADIAL", "NEW", "cameras.txt:1: expected a row NAME MODEL"),
+        ("cameras", " -0.0811", "", "cameras.txt:1: camera model SIMPLE_RADIAL takes 4 parameters"),
+        ("images", "0 0 1 db/8", "0 0 3 db/8", "images.txt:3: camera 3 is not in cameras.txt"),
+        ("images", "8 1", "7 1", "images.txt:3: image id 7 is listed twice"),
+        ("images", "7 1 0", "7 nan 0", "images.txt:1: expected finite numbers IMAGE_ID QW"),
+        ("images", "2 1 db/7.jpg", "2 1", "images.txt:1: 9 columns instead of 10"),
+        ("cameras", "1600", "0", "cameras.txt: camera 1: image size 0x1067"),
+        ("images", "7 1 0 0 0", "7 0 0 0 0", "images.txt: image 'db/7.jpg': .*quaternion"),
+        ("images", "db/7", "../7", "images.txt: image '../7.jpg': .*leads out"),
+        ("images", "db/8", "db/7", "'db/7.jpg': is listed twice"),
+    ],
+)
+def test_a_wrong_text_model_is_named(
+    tmp_path: Path, name: str, old: str, new: str, message: str
+) -> None:
+    texts = {"cameras": CAMERAS, "images": IMAGES, "points3D": ""}
+    texts[name] = texts[name].replace(old, new)
+    for file, text in texts.items():
+        (tmp_path / f"{file}.txt").write_text(text)
+    with pytest.raises(DataError, match=message) as caught:
+        read_colmap_model(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("\n\n", "\n"),
+        lambda text: f"\ufeff# comment\n{text}".replace("\n", "\r\n"),
+        lambda text: text.replace("db/", "my photos/day 1/").replace("8.jpg", "8"),
+        lambda text: text.replace("db/", "db\\"),
+        lambda text: text.replace("db/7.jpg\n", "db/7.jpg\n1.5 2.5 -1 3 4 -1 5 6 -1 7 8 -1"),
+    ],
+    ids=["no lines of features", "Windows", "blanks in names", "backslashes", "features"],
+)
+def test_images_of_other_tools_are_read(tmp_path: Path, change: Callable[[str], str]) -> None:
+    for file, text in (("cameras", CAMERAS), ("images", change(IMAGES)), ("points3D", "")):
+        (tmp_path / f"{file}.txt").write_text(text, encoding="utf-8", newline="")
+    names = [image.name for image in read_colmap_model(tmp_path).images]
+    assert [name[-5:].removesuffix(".jpg")[-1] for name in names] == ["7", "8"]
+    assert len({name.rpartition("/")[0] for name in names} & {"db", "my photos/day 1"}) == 1
+
+
+def test_camera_models_that_kapture_lacks_are_refused_by_name(tmp_path: Path) -> None:
+    model, params = "SIMPLE_DIVISION", (500.0, 320.0, 240.0, 0.01)
+    camera = pycolmap.Camera(camera_id=1, model=model, width=640, height=480, params=params)
+    written = pycolmap.Reconstruction()
+    written.add_camera_with_trivial_rig(camera)
+    written.write_binary(tmp_path)
+    with pytest.raises(DataError, match=f"cameras.*camera model {model}; .*undistorter"):
+        read_colmap_model(tmp_path)

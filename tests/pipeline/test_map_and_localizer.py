@@ -1,8 +1,9 @@
-"""Maps of any tool: their types, extractors, pixel origin and missing parts."""
+"""Maps of any tool: their types, extractors, pixel origin, and localization in them."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,22 +11,25 @@ from typing import Any
 import numpy as np
 import pytest
 
+from megloc_kapture import Failure, KaptureMap, Localizer, Pose, Query
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
+    KaptureData,
     KaptureFolder,
     Sensor,
     write_sensors,
 )
-from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
-from megloc_kapture.pipeline.live_source import extract_again, local_types_of
-from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.kapture_map import MapKeypoints
+from megloc_kapture.pipeline.live_source import extract_again
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.plugins import PluginChoice
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.values import LocalFeatures
 from tests.pipeline.runs import errors
 
 
@@ -46,18 +50,6 @@ def shift_intrinsics(root: Path, shift_px: float) -> None:
         for name, sensor in data.sensors.items()
     }
     write_sensors(root, replace(data, sensors=moved))
-
-
-def test_our_map_follows_colmap(workspace: Path) -> None:
-    opened = KaptureMap.open(workspace / "map")
-    assert list(opened.keypoints) == ["rootsift"]
-    assert (opened.pixel_origin.intrinsics, opened.pixel_origin.keypoints) == ("corner", "corner")
-    assert opened.pixel_origin.error_px["corner"] < opened.pixel_origin.error_px["centre"]
-    assert len(opened.images) == 7
-    keypoints = opened.keypoints["rootsift"]
-    assert keypoints.has_descriptors(opened.images) and opened.has_images()
-    assert keypoints.extractor() == PluginChoice(name="rootsift")
-    assert opened.global_types() == ["vlad_rootsift"]
 
 
 @pytest.mark.parametrize("intrinsics", ["corner", "centre"])
@@ -156,14 +148,7 @@ def test_unusable_maps_are_refused(workspace: Path, map_copy: Path, tmp_path: Pa
         KaptureMap.open(map_copy)
 
 
-def test_features_of_other_folders_are_used_and_their_sizes_checked(
-    workspace: Path, map_copy: Path
-) -> None:
-    opened = KaptureMap.open(map_copy)
-    file = map_copy / "reconstruction/descriptors/rootsift/0003.jpg.desc"
-    file.write_bytes(file.read_bytes()[:-512])
-    with pytest.raises(DataError, match=r"0003\.jpg\.desc: 799 descriptors for 800 keypoints"):
-        opened.check()
+def test_features_of_other_folders_are_used(workspace: Path, map_copy: Path) -> None:
     shutil.rmtree(map_copy / "reconstruction" / "descriptors")
     bare = KaptureMap.open(map_copy)
     assert not bare.keypoints["rootsift"].has_descriptors(bare.images)
@@ -233,14 +218,122 @@ def test_extractors_are_recognised_by_names_of_other_tools(
     assert expected == (found and " ".join([found.name, *map(str, found.options.values())]))
 
 
-def test_an_unknown_type_is_refused_with_the_remedy(map_copy: Path) -> None:
-    for kind in ("keypoints", "descriptors"):
-        folder = map_copy / "reconstruction" / kind
-        (folder / "rootsift").rename(folder / "D2-Net")
-        config = folder / "D2-Net" / f"{kind}.txt"
-        config.write_text(config.read_text().replace("rootsift", "D2-Net"))
-    observations = map_copy / "reconstruction" / "observations.txt"
-    observations.write_text(observations.read_text().replace("rootsift", "D2-Net"))
-    (local,) = local_types_of(KaptureMap.open(map_copy), options_of_preset("classic"))
-    with pytest.raises(DataError, match=r"'D2-Net'.*known: .*rootsift.*D2-Net/keypoints\.txt"):
-        _ = local.extractor
+def few(*assignments: str) -> PipelineOptions:
+    """Return the options that the map was made with."""
+    keypoints = "local_features.options.max_keypoints=800"
+    return options_of_preset(assignments=[keypoints, *assignments])
+
+
+@pytest.fixture(scope="module")
+def opened(workspace: Path) -> KaptureMap:
+    return KaptureMap.open(workspace / "map")
+
+
+@pytest.fixture(scope="module")
+def localizer(opened: KaptureMap) -> Localizer:
+    return Localizer(opened, options=few())
+
+
+@pytest.fixture(scope="module")
+def truth(scene: Path) -> KaptureData:
+    return KaptureFolder(scene / "query_gt").read()
+
+
+@pytest.fixture(scope="module")
+def image(scene: Path) -> Path:
+    """The image of the query 0004.jpg."""
+    return scene / "query" / "sensors" / "records_data" / "0004.jpg"
+
+
+@pytest.fixture(scope="module")
+def queries(workspace: Path, scene: Path) -> list[Query]:
+    """The four queries with their features."""
+    folder = KaptureFolder(scene / "query", features_dirs=[workspace])
+    data = folder.read()
+    keypoints, descriptors = folder.keypoints("rootsift"), folder.descriptors("rootsift")
+    scores = np.zeros(800, np.float32)
+    return [
+        Query(
+            camera=data.camera_of(name),
+            name=name,
+            features={
+                "rootsift": LocalFeatures(keypoints.read(name), scores, descriptors.read(name))
+            },
+        )
+        for name in data.image_names()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((10, 10, 3), np.uint8), r"is uint8 \(300, 400, 3\), got uint8 \(10, 10, 3\)"),
+        (np.zeros((300, 400, 3)), r"is uint8 \(300, 400, 3\), got float64"),
+    ],
+    ids=["size", "float"],
+)
+def test_invalid_images_are_errors(
+    localizer: Localizer, truth: KaptureData, image: object, message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        localizer.localize(image, truth.camera_of("0004.jpg"))  # type: ignore[arg-type]
+
+
+def test_masked_pixels_have_no_features(
+    localizer: Localizer, image: Path, truth: KaptureData
+) -> None:
+    query = Query(truth.camera_of("0004.jpg"), image)
+    mask = np.zeros((300, 400), bool)
+    assert not localizer.localize_query(replace(query, mask=mask))
+    mask[:, 180:] = True
+    half = localizer.localize_query(replace(query, mask=mask))
+    whole = localizer.localize_query(query)
+    assert isinstance(half, Pose) and isinstance(whole, Pose)
+    assert half.num_matches != whole.num_matches
+    with pytest.raises(DataError, match="a mask is bool"):
+        localizer.localize_query(replace(query, mask=mask[:10]))
+
+
+def test_a_prior_restricts_the_candidates(
+    localizer: Localizer, image: Path, truth: KaptureData
+) -> None:
+    camera = truth.camera_of("0004.jpg")
+    found = localizer.localize(image, camera, prior=["0003.jpg", "0005.jpg", "0003.jpg"])
+    assert set(found.candidates) == {"0003.jpg", "0005.jpg"}
+    assert errors(found, truth.cam_from_world("0004.jpg"))[0] < 0.05
+    assert localizer.localize(image, camera, prior=[]) == Failure("no map image is a candidate")
+    with pytest.raises(DataError, match=r"0004\.jpg has the candidate 0001\.jpg, which is not"):
+        localizer.localize(image, camera, prior=["0003.jpg", "0001.jpg"])
+
+
+def test_candidates_are_ranked_by_retrieval(opened: KaptureMap, queries: list[Query]) -> None:
+    narrow = Localizer(opened, options=few("query_pairs.top_k=2"))
+    # neighbours along the walk, by VLAD of the local features
+    neighbours = {"0007.jpg": {"0006.jpg", "0009.jpg"}, "0010.jpg": {"0008.jpg", "0009.jpg"}}
+    for query in queries:
+        found = narrow.localize_query(query)
+        ranked = narrow.ranked(query)
+        assert len(ranked) == 2 and set(found.candidates) <= set(ranked)
+        assert set(ranked) == neighbours.get(query.name, set(ranked))
+        # within a prior, the best of those
+        kept = replace(query, prior=("0000.jpg", "0002.jpg", "0009.jpg"))
+        assert set(narrow.ranked(kept)) < set(kept.prior or ())
+
+
+def test_many_queries_are_localized_lazily_and_in_order(
+    localizer: Localizer, queries: list[Query], truth: KaptureData
+) -> None:
+    read: list[str] = []
+
+    def given() -> Iterator[Query]:
+        for query in queries:
+            read.append(query.name)
+            yield query
+
+    results = localizer.localize_many(given())
+    assert read == []
+    first = next(results)
+    assert read == [queries[0].name]
+    for query, found in zip(queries, [first, *results], strict=True):
+        assert errors(found, truth.cam_from_world(query.name))[0] < 0.02
+    assert read == [query.name for query in queries]

@@ -1,9 +1,9 @@
-"""Batches on a device: equal results, smaller batches when memory runs out, placement."""
+"""Declarations of stages, ordered work, batches on a device, placement of networks."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,6 +24,7 @@ from megloc_kapture.io.kapture import ImagePair
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import TwoViewOptions
 from megloc_kapture.nets.runtime import pick_device
+from megloc_kapture.pipeline.evaluation_plan import PIPELINE
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -36,8 +37,10 @@ from megloc_kapture.stages.local_features import (
     extract_local_features,
 )
 from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
-from megloc_kapture.stages.stage import wanted_stages
-from megloc_kapture.stages.work import Work, in_batches, is_out_of_memory
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.query_poses import LocalizeQueries
+from megloc_kapture.stages.stage import PipelineStage, StageWork, wanted_stages
+from megloc_kapture.stages.work import FolderSpec, Work, in_batches, is_out_of_memory, ordered_map
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 from tests.worlds import folder_bytes
 
@@ -157,30 +160,6 @@ def test_other_errors_are_not_retried(eight_at_once: None) -> None:
         batched(Limited(9), lambda _: [])
 
 
-def test_matches_of_a_batch(
-    shared_data: Path, frames: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(devices, "_limits", {})
-    weights = shared_data / "weights"
-    options = {"weights": str(weights / "xfeat" / "xfeat.pt"), "threshold": 0.02, "device": "cpu"}
-    extractor = load_plugin(LOCAL_FEATURES, "xfeat", options)
-    images = [
-        ImageFeatures(features.keypoints_px[:number], features.descriptors[:number], 144, 96)
-        for number, features in zip(
-            (200, 300, 150, 0, 250), (extractor.extract(image) for image, _ in frames), strict=True
-        )
-    ]
-    options = {"weights": str(weights / "lighterglue" / "xfeat-lighterglue.pt"), "device": "cpu"}
-    matcher = load_plugin(MATCHERS, "lighterglue", options)
-    first, *others = images
-    alone = [matcher.match(first, other) for other in others]
-    assert sum(len(matches) for matches, _ in alone) > 30
-    together = matcher.match_many(first, others)  # padded to one size
-    for (matches, scores), (expected, expected_scores) in zip(together, alone, strict=True):
-        np.testing.assert_array_equal(matches, expected)
-        np.testing.assert_allclose(scores, expected_scores, atol=1e-4)
-
-
 class ManySift(RootSift):
     """Extracts several images at once."""
 
@@ -282,3 +261,88 @@ def test_a_localizer_takes_device_and_precision(world: Any) -> None:
     options = options_of_preset("classic", assignments={"device": "cpu"})
     with pytest.raises(OptionError, match="give the device and the precision in the options"):
         Localizer(opened, options=options, device="cuda")
+
+
+class Declares(PipelineStage):
+    name = "declares"
+    uses = ("local_features.name", "mask_margin_px", "triangulation.two_view_tracks")
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return {}
+
+
+def test_settings_are_the_declared_options() -> None:
+    options = PipelineOptions(
+        local_features=({"name": "rootsift", "options": {"max_keypoints": 5}}, {"name": "sift"})
+    )
+    assert Declares(options).settings() == {
+        "local_features": [{"name": "rootsift"}, {"name": "sift"}],
+        "mask_margin_px": 4.0,
+        "triangulation": {"two_view_tracks": False},
+    }
+
+
+def test_a_new_matcher_changes_settings_of_matching_stages_only() -> None:
+    changed = PipelineOptions(matching={"name": "nn", "options": {"max_ratio": 0.5}})
+    same = [kind.name for kind in PIPELINE if isinstance(kind.name, str)]
+    for kind in PIPELINE:
+        before, after = kind(PipelineOptions()), kind(changed)
+        if before.settings() != after.settings():
+            same.remove(before.name)
+    assert set(same) >= {"local_features", "global_features", LocalizeQueries.name, "map"}
+    assert not {"mapping_matches", "query_matches"} & set(same)
+
+
+def test_no_stage_reads_the_output_of_a_later_stage() -> None:
+    for options in (PipelineOptions(), PipelineOptions(reranking={"by": "verified"})):
+        written: list[str] = []
+        stages = wanted_stages(PIPELINE, options)
+        for at, stage in enumerate(stages):
+            written += stage.writes
+            later = {path for other in stages[at + 1 :] for path in other.writes}
+            assert not set(stage.reads) & (later - set(written)), stage.name
+
+
+def test_results_are_in_order() -> None:
+    first_may_end = threading.Event()
+
+    def work(value: int) -> int:
+        if value == 0:
+            assert first_may_end.wait(timeout=30)
+        if value == 5:
+            first_may_end.set()
+        return value
+
+    with ThreadPoolExecutor(3) as executor:
+        assert list(ordered_map(work, range(20), executor, window=8)) == list(range(20))
+        assert list(ordered_map(work, [], executor)) == []
+    # without an executor results are computed lazily
+    done: list[int] = []
+    results = ordered_map(lambda value: done.append(value) or value, [3, 1, 2])
+    assert done == []
+    assert next(iter(results)) == 3
+    assert done == [3]
+    assert list(results) == [1, 2]
+
+
+def test_at_most_a_window_of_items_is_submitted() -> None:
+    taken = 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        for value in range(100):
+            taken += 1
+            yield value
+
+    with ThreadPoolExecutor(2) as executor:
+        results = ordered_map(int, items(), executor, window=5)
+        for count, _ in enumerate(results, start=1):
+            assert taken <= count + 5
+
+
+def test_a_folder_is_opened_once_in_a_run(world: Any) -> None:
+    spec = FolderSpec(world.mapping())
+    assert spec.open() is spec.open()
+    # another run opens it again and reads new features
+    other = FolderSpec(world.mapping())
+    assert other.open() is not spec.open()
