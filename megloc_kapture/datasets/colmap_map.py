@@ -24,7 +24,7 @@ from megloc_kapture.io.colmap_model import (
     colmap_model_files,
     read_colmap_model,
 )
-from megloc_kapture.io.files import link_records
+from megloc_kapture.io.files import link_as_text, link_records
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -93,6 +93,9 @@ def find_colmap(
     require(database is None or database.is_file(), "no such database", path=database)
     around = [Path(os.path.abspath(model))]
     around += around[0].parents[: 2 if around[0].parent.name == SPARSE else 1]
+    if images is None:
+        remarks = "".join(link_as_text(folder / IMAGES) for folder in around)
+        require(not remarks, f"the folder of its images is missing{remarks}", path=path)
     found_images = (folder / IMAGES for folder in around if (folder / IMAGES).is_dir())
     found_databases = (folder / DATABASE for folder in around if (folder / DATABASE).is_file())
     return ColmapFolders(

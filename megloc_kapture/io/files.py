@@ -209,6 +209,14 @@ def user_cache() -> Path:
 # -------------------------------------------------------------------------------------- links
 
 
+def link_as_text(path: Path) -> str:
+    """Return a remark if ``path`` or a parent is a file in place of a folder, else ""."""
+    file = next((folder for folder in (path, *path.parents) if folder.is_file()), None)
+    if file is None:
+        return ""
+    return f"; {file} is a file, perhaps a link that git or zip stored as text: make it a folder"
+
+
 def link_images(
     source_root: Path,
     output_root: Path,

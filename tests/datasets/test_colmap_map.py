@@ -230,11 +230,14 @@ def test_images_and_database_are_searched_near_the_model(
 def test_ambiguous_and_missing_models_are_refused(room: Path) -> None:
     model = room / "sparse" / "0"
     shutil.copytree(model, room / "sparse" / "1")
+    shutil.copytree(model, room / "stored")
+    (room / "stored" / "images").write_text("../images")
     for path, given, message in (
         (room, {}, "several models, give one of them: sparse/0, sparse/1"),
         (room / "images", {}, "images: no COLMAP model: neither images.bin nor"),
         (room.parent, {}, "no COLMAP model: .*; there is one in .*room/sparse/0"),
         (room / "none", {}, "none: no such folder; give the folder of a COLMAP model"),
+        (room / "stored", {}, "stored: the folder of its images is missing; .*stored/images is a"),
         (model, {"images": room / "none"}, "none: no such folder of images"),
         (model, {"database": room / "images"}, "images: no such database"),
     ):

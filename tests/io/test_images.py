@@ -11,6 +11,7 @@ import pytest
 from PIL import Image, ImageOps
 from PIL.TiffImagePlugin import IFDRational
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import (
     EXIF_DEVIATION,
     GUESS_DEVIATION,
@@ -173,3 +174,11 @@ def test_images_are_recognised_by_their_content(tmp_path: Path) -> None:
     (tmp_path / "f.json").write_bytes(b"{}")
     noise(16, 16).save(tmp_path / "g", "ICO")
     assert not any(is_image(tmp_path / name) for name in ("f.json", "g", "nowhere"))
+
+
+def test_a_link_that_was_stored_as_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "images").write_text("../elsewhere")
+    with pytest.raises(DataError, match=r"no such image; .*images is a file, perhaps a link"):
+        read_image_rgb(tmp_path / "images" / "a" / "1.jpg")
+    with pytest.raises(DataError, match=r"no such image$"):
+        read_image_rgb(tmp_path / "a" / "1.jpg")

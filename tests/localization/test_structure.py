@@ -38,7 +38,7 @@ def by_scipy(a: Image, b: Image, valid: NDArray[np.bool_], window: float) -> flo
     def blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return gaussian_filter(values, sigma, mode="constant", radius=reach)
 
-    share = blurred(valid * 1.0)
+    share = np.maximum(blurred(valid * 1.0), 1e-300)  # 0 far from any valid pixel
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return blurred(values * valid) / share
