@@ -137,3 +137,9 @@ def no_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MEGLOC_WEIGHTS", str(tmp_path_factory.mktemp("no-weights")))
         yield
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take minutes, so that none of them runs alone at the end."""
+    longest = ("test_neural_field.py", "test_gpu_smoke.py", "test_whole_runs.py")
+    items.sort(key=lambda item: item.path.name not in longest)
