@@ -18,7 +18,7 @@ from megloc_kapture.evaluation.pose_files import parse_pose, parse_timestamp
 from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
 from megloc_kapture.evaluation.report.content import counted
 from megloc_kapture.geometry.poses import (
-    CONVENTIONS,
+    READINGS,
     better_conventions,
     camera_centers,
     rotation_matrices,
@@ -395,7 +395,7 @@ def _check_poses(
     sample = names[:: -(-len(names) // _SAMPLE)]
     distances = [
         tree.query(_frames([in_local(n, read(poses[n])) for n in sample], extent))[0]
-        for read in (lambda pose: pose, *CONVENTIONS.values())
+        for read in READINGS
     ]
     near = max(_NEAR * min(float(np.median(d)) for d in distances), _LEAST * extent)
     shares = [float((d <= near).mean()) for d in distances]

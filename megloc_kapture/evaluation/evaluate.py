@@ -29,7 +29,7 @@ from megloc_kapture.evaluation.results import (
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.geometry.poses import (
-    CONVENTIONS,
+    READINGS,
     align_poses,
     better_conventions,
     camera_centers,
@@ -319,7 +319,7 @@ def _convention_note(estimated: Poses, true: Poses, images: Sequence[str]) -> st
     sides = {"results": (estimated, true), "true poses": (true, estimated)}
     for whose, (poses, others) in sides.items():
         shares = []
-        for read in (lambda pose: pose, *CONVENTIONS.values()):
+        for read in READINGS:
             errors = pose_errors({image: read(poses[image]) for image in images}, others, images)
             near = errors.position_m <= _NEAR_SHARE * extent_m
             shares.append(float((near & (errors.angle_deg <= _NEAR_DEG)).mean()))

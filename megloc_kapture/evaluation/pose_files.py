@@ -108,14 +108,15 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     lines, comments and a header that names the columns are accepted.
     """
     text = read_text(path)
-    rows = _in_column_order(_rows(text))
-    if is_colmap_images(text):
+    if not is_colmap_images(text):
+        rows = _in_column_order(_rows(text))
+    else:
         rows = ((number, [*fields[9:], *fields[1:8]]) for number, fields, _ in image_rows(text))
     poses: dict[str, RigidTransform | None] = {}
     for number, fields in rows:
-        name = fields[0].replace("\\", "/")
         with named(path, number):
             require(len(fields) == 8, f"{len(fields)} columns instead of 8 ({COLUMNS})")
+            name = fields[0].replace("\\", "/")
             require(name not in poses, f"{name!r} is given twice")
             values = [parse_number(field) for field in fields[1:]]
             failed = not np.isfinite(values).all() or not any(values[:4])

@@ -375,11 +375,17 @@ CONVENTIONS: Mapping[str, Callable[[RigidTransform], RigidTransform]] = {
 }
 """Name of a convention -> function that converts a pose given in it to COLMAP's convention."""
 
+READINGS: Sequence[Callable[[RigidTransform], RigidTransform]] = (
+    lambda pose: pose,
+    *CONVENTIONS.values(),
+)
+"""Functions that read a pose as given, then in each of :data:`CONVENTIONS`."""
+
 
 def better_conventions(shares: Sequence[float]) -> list[str]:
     """Return the names of the conventions that explain far more than the poses as given.
 
-    ``shares`` of explained data are for the poses as given, then for :data:`CONVENTIONS`.
+    ``shares`` of explained data are for :data:`READINGS`.
     """
     given, *others = shares
     best = max(others)

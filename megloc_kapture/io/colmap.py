@@ -72,6 +72,13 @@ def new_colmap_camera(camera: Camera) -> Any:
 colmap_camera = lru_cache(maxsize=4096)(new_colmap_camera)
 
 
+def new_colmap_pose(pose: RigidTransform) -> Any:
+    pycolmap = load_pycolmap()
+    w, x, y, z = pose.quat_wxyz
+    rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+    return pycolmap.Rigid3d(rotation, np.array(pose.translation))
+
+
 def normalized_from_px(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Undistort pixels (N, 2) to normalised image coordinates (x/z, y/z), float64 (N, 2)."""
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
@@ -335,10 +342,7 @@ def _posed_reconstruction(
         entry = pycolmap.Image(
             image_id=image_id, name=image.name, camera_id=camera_id, keypoints=keypoints
         )
-        w, x, y, z = image.cam_from_world.quat_wxyz
-        rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
-        pose = pycolmap.Rigid3d(rotation, np.array(image.cam_from_world.translation))
-        reconstruction.add_image_with_trivial_frame(entry, pose)
+        reconstruction.add_image_with_trivial_frame(entry, new_colmap_pose(image.cam_from_world))
     return reconstruction
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.poses import CONVENTIONS, better_conventions
+from megloc_kapture.geometry.poses import READINGS, better_conventions
 from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
 from megloc_kapture.values import RigidTransform
 
@@ -30,7 +30,7 @@ class PairEvidence:
     """Matches of a pair that fit its poses.
 
     ``num`` is the number of verified matches; ``fitting`` has the numbers of those that fit the
-    poses as given, then the poses converted from each of :data:`CONVENTIONS`.
+    poses as given, then the poses converted from each of :data:`~.poses.CONVENTIONS`.
     """
 
     image: str
@@ -57,7 +57,7 @@ def count_fitting(
     """
     options = KnownPoseOptions(max_error_px=_MAX_ERROR_SHARE * side_px)
     counts = []
-    for read in (lambda pose: pose, *CONVENTIONS.values()):
+    for read in READINGS:
         a, b = map(read, poses)
         good = verify_with_poses(
             rays_a, slopes_a, rays_b, slopes_b, b @ a.inverse(), options, min_matches=0

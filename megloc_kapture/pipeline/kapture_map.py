@@ -137,7 +137,7 @@ class KaptureMap:
         data = folder.read()
         check_points(folder, "localize in")
         require(
-            data.poses(),
+            any(data.cam_from_world(image) is not None for image in data.image_names()),
             "no image of the map has a pose: sensors/trajectories.txt is missing, or has other "
             "timestamps or sensors than records_camera.txt",
             path=folder.root,

@@ -114,6 +114,7 @@ def test_rows_without_a_pose_are_misses(tmp_path: Path, caplog: pytest.LogCaptur
     [
         (read_pose_file, GOOD, "b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
         (read_pose_file, GOOD, "b.jpg 1,0 0,0 0,0 0,0 1,5 -0,2 3,0", "'1,0' is not a number"),
+        (read_pose_file, "7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n", "8", "0 columns instead of 8"),
         (read_pose_file, GOOD, "1.5 1 2 3 0 0 0 1", "'1.5': the quaternion is last, as in traj"),
         (read_pose_file, GOOD, "b.jpg 1.0011 0 0 0 1 -0.2 3", "length 1.0011"),
         (read_pose_file, GOOD, "a.jpg 1 0 0 0 1 -0.2 3", "given twice"),

@@ -123,10 +123,11 @@ def _cutouts(
     frames: list[Frame] = []
     camera = cutout_camera(options.cutout_width, options.cutout_height)
     folder = f"database/cutouts/{_FLOORS[floor]}/{number:03d}"
+    # a panorama has a single exposure
+    rng = stream(options.seed, "inloc", "light", _transformation(floor, number))
+    lighting = lamp_lighting(rng, noise=1.0)
     for yaw, pitch in itertools.product(YAWS_DEG, PITCHES_DEG):
         name = f"{folder}/{_BUILDING}_cutout_{number:03d}_{yaw}_{pitch}.jpg"
-        # a panorama has a single exposure
-        rng = stream(options.seed, "inloc", "light", _transformation(floor, number))
         frames.append(
             Frame(
                 name=name,
@@ -137,7 +138,7 @@ def _cutouts(
                 sensor_id="cutout",
                 camera=camera,
                 cam_from_world=cam_from_scan(yaw, pitch) @ scan_from_floor,
-                lighting=lamp_lighting(rng, noise=1.0),
+                lighting=lighting,
                 noise_seed=noise_seed(options.seed, name),
             )
         )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.nvm import NvmModel
-from megloc_kapture.io.colmap import load_pycolmap, new_colmap_camera
+from megloc_kapture.io.colmap import load_pycolmap, new_colmap_camera, new_colmap_pose
 from megloc_kapture.io.colmap_model import ColmapModel, SparsePoints
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import Work
@@ -190,11 +190,9 @@ def write_colmap_model(folder: Path, model: ColmapModel, *, text: bool) -> None:
         ids = points.feature_ids[rows]
         xy_px = np.zeros((int(ids.max(initial=-1)) + 1, 2))
         xy_px[ids] = points.xy_px[rows]
-        w, x, y, z = image.cam_from_world.quat_wxyz
-        rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
         written.add_image_with_trivial_frame(
             pycolmap.Image(image.name, xy_px, image.camera_id, image.image_id),
-            pycolmap.Rigid3d(rotation, np.array(image.cam_from_world.translation)),
+            new_colmap_pose(image.cam_from_world),
         )
     for xyz, rgb, track in _tracks(points):
         of_image = [model.images[position].image_id for position in points.image_ids[track]]

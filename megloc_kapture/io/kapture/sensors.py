@@ -51,10 +51,10 @@ def read_kapture_data(root: Path) -> KaptureData:
     require(root.is_dir(), "a file; give a kapture folder", path=root)
     if not folder.is_dir():
         inner = ", ".join(sorted(p.parents[1].name for p in root.glob("*/sensors/sensors.txt")))
+        if inner:
+            raise DataError(f"no kapture folder, but {inner} in it: give one of them", path=root)
         raise DataError(
-            f"no kapture folder, but {inner} in it: give one of them"
-            if inner
-            else "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
+            "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
             "--images` localizes them, `megloc map` makes a map of them. Poses? `megloc evaluate` "
             "takes pose files and COLMAP models",
             path=root,
