@@ -16,6 +16,7 @@ from megloc_kapture.values import Options
 _BLOCK_ELEMENTS = 1 << 24  # similarities in memory, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # elements of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # largest number of rows in a block, even if vectors are short
+_GROUP = 8  # scores of which only the largest is used to find a bound of the best
 Float32 = NDArray[np.float32]
 Matrices = Sequence[NDArray[np.floating[Any]]]
 Found = tuple[NDArray[np.int64], Float32]
@@ -174,14 +175,18 @@ def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]
     height, width = scores.shape
     if width <= count:
         return scores, np.broadcast_to(np.arange(width), scores.shape)
-    bound = np.partition(scores, width - count, axis=1)[:, width - count, None]
-    chosen = scores >= bound
-    surplus = np.count_nonzero(chosen, axis=1) - count
-    for row in np.flatnonzero(surplus):  # ties with the last selected score
-        equal = np.flatnonzero(scores[row] == bound[row])
-        chosen[row, equal[len(equal) - surplus[row] :]] = False
-    columns = np.nonzero(chosen)[1].reshape(height, count)
-    return np.take_along_axis(scores, columns, axis=1), columns
+    # the maxima of groups are fewer, and as many scores as maxima reach a bound
+    groups = width // _GROUP
+    maxima = scores
+    if groups > count:
+        maxima = scores[:, : groups * _GROUP].reshape(height, _GROUP, groups).max(axis=1)
+    bound = np.partition(maxima, -count, axis=1)[:, -count, None]
+    rows, columns = np.nonzero(scores >= bound)
+    values = scores[rows, columns]
+    best_first = np.lexsort((-values, rows))
+    start = np.searchsorted(rows, np.arange(height))
+    chosen = best_first[start[:, None] + np.arange(count)]
+    return values[chosen], columns[chosen]
 
 
 FusionMethod = Literal["ghm", "mean", "early", "reciprocal_rank"]

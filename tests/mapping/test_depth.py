@@ -18,6 +18,7 @@ from megloc_kapture.mapping.depth import (
     DepthVerificationOptions,
     contradicted_by_depth,
     lift_keypoints,
+    lift_with_covariances,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -76,6 +77,20 @@ def test_the_centre_of_the_first_pixel_is_at_half_a_pixel() -> None:
     points, valid = lift_keypoints(keypoints, depth, camera, camera, IDENTITY)
     assert valid.all()
     np.testing.assert_allclose(points[:, 2], [4.9, 4.95, 5.0], rtol=1e-6)
+
+
+def test_covariances_are_long_by_the_depth_and_wide_by_the_keypoint() -> None:
+    depth = np.full((48, 64), 5.0, np.float32)
+    sigma = np.full((48, 64), 0.02, np.float32)
+    sigma[:, 40:] = 0.0  # unknown
+    pixels = np.array([[12.0, 36.0], [50.0, 20.0]])
+    points, covariances, valid = lift_with_covariances(pixels, depth, sigma, SMALL, SMALL)
+    assert valid.tolist() == [True, False]
+    ray = np.array([-20 / 60, 12 / 60, 1.0])
+    np.testing.assert_allclose(points[0], 5 * ray)
+    # sigma is that of a third of a pixel
+    expected = 0.06**2 * np.outer(ray, ray) + (5 / 60) ** 2 * np.diag([1.0, 1.0, 0.0])
+    np.testing.assert_allclose(covariances[0], expected)
 
 
 def test_keypoints_on_an_edge_have_no_depth(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from poses import WRONG_CONVENTIONS
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.mapping.map_check import ObservedKeypoints, camera_fault, map_fault
+from megloc_kapture.mapping.map_check import (
+    ObservedKeypoints,
+    camera_fault,
+    find_pixel_origin,
+    map_fault,
+)
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 330.0, 235.0))
@@ -144,3 +149,22 @@ def test_a_single_wrong_image_is_no_fault_of_the_map() -> None:
 )
 def test_unusual_cameras_have_no_fault(camera: Camera) -> None:
     assert camera_fault(camera) is None
+
+
+@pytest.mark.parametrize(
+    ("shift_px", "centred", "expected"),
+    [
+        (0.0, False, ("corner", "corner")),
+        (0.0, True, ("centre", "centre")),
+        (-0.5, False, ("corner", "centre")),
+        (0.5, False, ("centre", "corner")),
+    ],
+)
+def test_pixel_origins_of_keypoints_and_intrinsics(
+    shift_px: float, centred: bool, expected: tuple[str, str]
+) -> None:
+    images, xyz = with_pixels(lambda k: k + np.float32(shift_px))(good_map(noise_px=0.3))
+    principal = (319.5, 239.5) if centred else (320.0, 240.0)
+    cameras = [Camera("PINHOLE", 640, 480, (500.0, 510.0, *principal))]
+    origin = find_pixel_origin(images, xyz, cameras=cameras)
+    assert (origin.intrinsics, origin.keypoints) == expected

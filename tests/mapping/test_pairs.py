@@ -131,6 +131,8 @@ def by_sets(
     st.integers(1, 4),
     st.integers(1, 20),
 )
+# images 0 and 1 share one point, images 1 and 2 two
+@example(3, [(0, 0), (0, 1), (1, 1), (1, 2), (2, 1), (2, 2)], 3, 2, 20)
 def test_pairs_by_covisibility_equal_the_sets(
     num_images: int,
     observations: list[tuple[int, int]],

@@ -97,7 +97,7 @@ def test_ties_go_to_the_smaller_index_and_empty_sets_have_no_matches() -> None:
     one_way = match_nearest(same, same, NearestNeighbourOptions(mutual=False))[0]
     assert one_way.tolist() == [[0, 0], [1, 0], [2, 0]]
     # a single candidate has no ratio
-    alone = match_nearest(same[:2], same[:1], NearestNeighbourOptions(max_ratio=0.5))[0]
+    alone = match_nearest(same[:2], 2 * same[:1], NearestNeighbourOptions(max_ratio=0.5))[0]
     assert alone.tolist() == [[0, 0]]
     for a, b in ((same[:0], same), (same, same[:0]), (same[:0], same[:0])):
         matches, scores = match_nearest(a, b)
