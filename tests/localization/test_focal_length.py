@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from poses import rigid
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project, px_from_cam
 from megloc_kapture.io.images import guessed_camera
@@ -21,6 +22,7 @@ from megloc_kapture.localization.absolute_pose import (
 )
 from megloc_kapture.localization.focal_length import (
     FocalMisfit,
+    _linearized,
     estimate_with_intrinsics,
     focal_misfit,
     misfits_text,
@@ -54,6 +56,20 @@ def misfit(factor: float, *, noise_px: float = 1.0, seed: int = 0) -> FocalMisfi
     result = rig_pose([view])
     assert isinstance(result, Pose)
     return focal_misfit(PoseProblem.of([view]), result, OPTIONS)
+
+
+def test_derivatives_of_a_freed_camera_equal_central_differences() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-2, -2, 3), (2, 2, 8), (30, 3))
+    rays, change = rng.uniform(-0.5, 0.5, (30, 2)), np.array([0.05, 0.01, -0.02])
+
+    def residuals(step: Floats) -> Floats:
+        moved = Rotation.from_rotvec(step[:3]).apply(points) + step[3:6]
+        return _linearized(rays, moved, change + step[6:])[0]
+
+    steps = 1e-6 * np.eye(9)
+    expected = np.stack([(residuals(s) - residuals(-s)) / 2e-6 for s in steps], axis=2)
+    np.testing.assert_allclose(_linearized(rays, points, change)[1], expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.05])
