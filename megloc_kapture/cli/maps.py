@@ -39,10 +39,11 @@ from megloc_kapture.pipeline.presets import DEFAULT_PRESET
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS
-from megloc_kapture.stages.densifying import densify_map, fitted_to_poses, fuse_depth
+from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
 from megloc_kapture.stages.pose_refinement import refine_poses
 from megloc_kapture.stages.stage import LOCALIZED, MAP, count_text
+from megloc_kapture.stages.stereo_depth import fuse_depth
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,28 +37,22 @@ from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.kapture_map import restrictions_beside
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.plugin_loading import (
-    load_chosen,
-    load_plugin,
-    option_fault,
-    plugin_class,
-)
+from megloc_kapture.plugin_loading import load_chosen, load_plugin, option_fault, plugin_class
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.retrieval.search import FusionMethod
 from megloc_kapture.stages.global_features import extract_global_features, extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import (
     PairingMethod,
-    RerankingOptions,
     Retrieval,
     pair_map_images,
     pair_queries,
-    reranked,
 )
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import check_given_poses, match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
+from megloc_kapture.stages.reranking import RerankingOptions, reranked
 from megloc_kapture.stages.stage import count_text
 
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"

@@ -34,14 +34,7 @@ from megloc_kapture.io.dataset_tables import (
     PoseFileFormat,
     PoseFileNames,
 )
-from megloc_kapture.io.files import (
-    named,
-    read_content,
-    read_json_model,
-    read_text,
-    write_bytes,
-    write_json,
-)
+from megloc_kapture.io.files import named, read_content, read_json_model, read_text, write_json
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
 
@@ -94,10 +87,6 @@ def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
         numbers = " ".join(repr(float(v)) for v in (*pose.quat_wxyz, *pose.translation))
         lines.append(f"{name} {numbers}\n")
     return "".join(lines)
-
-
-def write_pose_file(path: Path | str, poses: Poses, *, names: Names = "full") -> None:
-    write_bytes(path, format_pose_file(poses, names=names).encode("utf-8"))
 
 
 def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:

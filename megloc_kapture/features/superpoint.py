@@ -24,12 +24,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.features.network import Images, LocalNetwork, LocalNetworkOptions, Masks
 from megloc_kapture.io.weights import WeightsFile, read_weights
 from megloc_kapture.nets.runtime import batch_counters, inference, load_strictly
-from megloc_kapture.nets.score_maps import (
-    CELL_PX,
-    pixel_scores,
-    select_pixels,
-    suppress_non_maxima,
-)
+from megloc_kapture.nets.score_maps import CELL_PX, pixel_scores, select_pixels, suppress_non_maxima
 from megloc_kapture.values import LocalFeatures
 
 _OFFICIAL_WEIGHTS = "superpoint_v1"

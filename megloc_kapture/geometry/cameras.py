@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.io.colmap import normalized_from_px as normalized_from_px
 from megloc_kapture.io.colmap import px_from_cam as px_from_cam
-from megloc_kapture.values import (
-    CAMERA_MODEL_NUM_PARAMS,
-    ONE_FOCAL_MODELS,
-    Camera,
-    RigidTransform,
-)
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera, RigidTransform
 
 PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
 # models whose first distortion parameter is the coefficient of the squared radius

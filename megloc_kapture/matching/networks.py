@@ -15,11 +15,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import WeightsFile
-from megloc_kapture.nets.kornia_networks import (
-    load_lighterglue,
-    load_lightglue,
-    require_kornia,
-)
+from megloc_kapture.nets.kornia_networks import load_lighterglue, load_lightglue, require_kornia
 from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions, inference
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,

@@ -34,11 +34,13 @@ from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES
 from megloc_kapture.stages.guided_pyramid import PyramidQueries
-from megloc_kapture.stages.image_pairs import PairQueries, RerankQueries
+from megloc_kapture.stages.image_pairs import PairQueries
+from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.matches import MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import RefinePoses
-from megloc_kapture.stages.query_poses import LocalizeQueries, set_aside_unreadable
+from megloc_kapture.stages.query_poses import LocalizeQueries
+from megloc_kapture.stages.reranking import RerankQueries
 from megloc_kapture.stages.stage import (
     EVALUATION,
     LOCALIZED,

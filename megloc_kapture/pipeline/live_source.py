@@ -35,7 +35,7 @@ from megloc_kapture.stages.global_features import (
     vlad_type,
 )
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
-from megloc_kapture.stages.image_pairs import Retrieval, counted, most_similar, rerank, vectors_of
+from megloc_kapture.stages.image_pairs import Retrieval, most_similar, vectors_of
 from megloc_kapture.stages.local_features import extract_all, read_frame, read_image_of
 from megloc_kapture.stages.map_features import rows_found_again
 from megloc_kapture.stages.matches import (
@@ -48,6 +48,7 @@ from megloc_kapture.stages.matches import (
     verified,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
+from megloc_kapture.stages.reranking import counted, rerank
 from megloc_kapture.stages.work import BATCH, batched
 from megloc_kapture.values import RigidTransform
 

@@ -17,9 +17,10 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Preprocessor, Query, Unit
+from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
-from megloc_kapture.stages.query_poses import localize_query, unreadable_image
+from megloc_kapture.stages.query_poses import localize_query
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, Precision, RigidTransform

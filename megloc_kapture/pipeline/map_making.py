@@ -40,13 +40,7 @@ from megloc_kapture.io.dataset_tables import (
     write_unit,
     write_unreadable,
 )
-from megloc_kapture.io.files import (
-    output_error,
-    remove,
-    temporary_name,
-    user_cache,
-    write_bytes,
-)
+from megloc_kapture.io.files import output_error, remove, temporary_name, user_cache, write_bytes
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import Workspace, map_of_workspace, run_plan
@@ -62,12 +56,12 @@ from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.guided_pyramid import PyramidMapping
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
+from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.map_points import MakePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess
-from megloc_kapture.stages.query_poses import set_aside_unreadable
 from megloc_kapture.stages.stage import (
     MAP,
     MAPPING,

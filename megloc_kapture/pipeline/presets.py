@@ -27,15 +27,12 @@ from megloc_kapture.plugins import (
     PluginChoice,
 )
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import (
-    MappingPairsOptions,
-    QueryPairsOptions,
-    RerankingOptions,
-)
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
+from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Options
 
 OptionsT = TypeVar("OptionsT", bound=Options)

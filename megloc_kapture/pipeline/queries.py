@@ -14,11 +14,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, check_option, require
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
-from megloc_kapture.plugins import (
-    DepthView,
-    GlobalFeatureExtractor,
-    LocalFeatureExtractor,
-)
+from megloc_kapture.plugins import DepthView, GlobalFeatureExtractor, LocalFeatureExtractor
 from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, carry_points, plan_frame
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.global_features import describe_images

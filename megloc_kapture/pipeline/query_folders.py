@@ -21,13 +21,7 @@ from megloc_kapture.datasets.kapture_folders import (
     with_cameras_of_images,
 )
 from megloc_kapture.errors import DataError, OptionError, check_option, require
-from megloc_kapture.io.files import (
-    TEMPORARY,
-    check_relative,
-    hard_link,
-    link_file,
-    link_images,
-)
+from megloc_kapture.io.files import TEMPORARY, check_relative, hard_link, link_file, link_images
 from megloc_kapture.io.images import (
     UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,

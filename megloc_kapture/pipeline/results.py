@@ -18,7 +18,7 @@ from megloc_kapture.io.tables import CONSISTENCY_FILE, status_row, write_consist
 from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs, Queries
-from megloc_kapture.stages.query_poses import unreadable_image, write_localized
+from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.stage import LOCALIZED
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Failure, Pose, RigidTransform

@@ -155,10 +155,6 @@ class Consistency:
     median: Displacement | None
     reason: str  # why the map is inconsistent; empty if it is consistent
 
-    @property
-    def consistent(self) -> bool:
-        return not self.reason
-
 
 @runtime_checkable
 class HoldsOut(Protocol):

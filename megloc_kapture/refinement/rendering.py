@@ -28,12 +28,7 @@ from megloc_kapture.refinement.photometric import (
     minimise,
     unoccluded_points,
 )
-from megloc_kapture.refinement.pyramid import (
-    Visibility,
-    choose_points,
-    usable_cells,
-    visibility,
-)
+from megloc_kapture.refinement.pyramid import Visibility, choose_points, usable_cells, visibility
 from megloc_kapture.refinement.references import (
     Displacement,
     ReferenceImages,

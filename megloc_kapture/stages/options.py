@@ -23,17 +23,13 @@ from megloc_kapture.plugins import (
 from megloc_kapture.retrieval.search import FusionOptions
 from megloc_kapture.stages.densifying import DensifyOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import (
-    MappingPairsOptions,
-    QueryPairsOptions,
-    RerankingOptions,
-    Retrieval,
-)
+from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions, Retrieval
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.matches import SecondMatchingOptions, Verification
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
+from megloc_kapture.stages.reranking import RerankingOptions
 from megloc_kapture.values import Device, Options, Precision
 
 

@@ -45,7 +45,7 @@ from megloc_kapture.refinement.references import (
     spread_names,
 )
 from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.query_poses import write_result_tables, write_timing
+from megloc_kapture.stages.localized_folder import write_result_tables, write_timing
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.stage import (
     LOCALIZED,

@@ -19,11 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError, require
-from megloc_kapture.io.files import (
-    link_file,
-    link_records,
-    write_json,
-)
+from megloc_kapture.io.files import link_file, link_records, write_json
 from megloc_kapture.io.images import image_as_read_back, image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugin_loading import Placement, checked_array, load_chosen

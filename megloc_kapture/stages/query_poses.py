@@ -7,11 +7,10 @@ localization").
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -20,29 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, read_unreadable, write_unreadable
-from megloc_kapture.io.files import link_images
-from megloc_kapture.io.kapture import (
-    ImagePair,
-    KaptureData,
-    KaptureFolder,
-    Sensor,
-    read_pairs,
-    write_sensors,
-)
-from megloc_kapture.io.tables import (
-    CLUSTERS_FILE,
-    COVARIANCE_FILE,
-    POSES_FILE,
-    REFINEMENT_FILE,
-    STATUS_FILE,
-    write_clusters,
-    write_covariances,
-    write_refinement,
-    write_status,
-)
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterOptions,
@@ -56,14 +34,13 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
 from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.stages.localized_folder import unreadable_queries, write_localized
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.scene import (
     KaptureScene,
     Unit,
     index_map,
     open_index,
-    poses_through_rig,
     query_units,
     shared_index,
     with_noise,
@@ -81,149 +58,8 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import (
-    HERE,
-    FolderSpec,
-    Work,
-)
-from megloc_kapture.values import (
-    MIN_CONFIDENCE,
-    Failure,
-    Fallback,
-    LocalizationResult,
-    Options,
-    Pose,
-    RigidTransform,
-)
-
-
-def write_localized(
-    output: Path,
-    query: KaptureFolder | KaptureData,
-    results: Iterable[Pose | Failure],
-    *,
-    fallback: Fallback = "none",
-    first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
-    timing: Path | None = None,
-) -> dict[str, int]:
-    """Write localized queries as kapture with tables of status, poses, clusters and covariances.
-
-    A query with an estimated focal length gets a separate camera.
-
-    Parameters
-    ----------
-    fallback : pose of a failed query: "none"; "retrieval", the pose of its best retrieved image;
-        "rig", derived from a localized camera of the same rig and timestamp.
-    first_candidates : best retrieved map image and its pose by query, for "retrieval".
-    timing : optional file for seconds per query and step.
-    """
-    data = query.read() if isinstance(query, KaptureFolder) else query
-    ordered = sorted(results, key=lambda result: result.name)
-    localized_poses = {result.name: result for result in ordered if isinstance(result, Pose)}
-    guesses: Mapping[str, tuple[str, RigidTransform]] = {}
-    if fallback == "retrieval":
-        guesses = first_candidates or {}
-    elif fallback == "rig":
-        guesses = poses_through_rig(data, localized_poses)
-    poses: dict[tuple[int, str], RigidTransform] = {}
-    sensors, records = dict(data.sensors), dict(data.records_camera)
-    written: list[LocalizationResult] = []
-    for result in ordered:
-        image = result.name
-        if isinstance(result, Pose):
-            record = data.record_of(image)
-            if result.camera is not None:
-                del records[record]
-                given = sensors[record[1]]
-                record = (record[0], f"{record[1]}-{record[0]}")
-                records[record] = image
-                sensors[record[1]] = Sensor.from_camera(result.camera, name=given.name)
-            poses[record] = result.cam_from_world
-        elif image in guesses:
-            poses[data.record_of(image)] = guesses[image][1]
-            result = replace(result, fallback=fallback)
-        written.append(result)
-    localized = KaptureData(sensors=sensors, trajectories=poses, records_camera=records)
-    write_sensors(output, localized)
-    if isinstance(query, KaptureFolder):
-        link_images(query.root, output)
-    write_result_tables(output, localized.poses(), written)
-    write_clusters(output / CLUSTERS_FILE, written)
-    if timing is not None:
-        write_timing(timing, written)
-    return {
-        "queries": len(written),
-        "localized": len(localized_poses),
-        "failed": len(written) - len(localized_poses),
-        "fallbacks": len(poses) - len(localized_poses),
-    }
-
-
-def write_result_tables(
-    output: Path, poses: Mapping[str, RigidTransform], results: Sequence[LocalizationResult]
-) -> None:
-    """Write tables of poses, status and covariances; if a pose was refined, also of refinement."""
-    write_poses(output / POSES_FILE, poses)
-    write_status(output / STATUS_FILE, results)
-    write_covariances(output / COVARIANCE_FILE, results)
-    if any(result.refinements for result in results):
-        write_refinement(output / REFINEMENT_FILE, results)
-
-
-def write_poses(path: Path, poses: Mapping[str, RigidTransform]) -> None:
-    """Write ``poses.csv``: ``cam_from_world`` and camera centre in the world by image."""
-    columns = ("image", "qw", "qx", "qy", "qz", "tx", "ty", "tz")
-    rows = (
-        (image, *map(repr, (*pose.quat_wxyz, *pose.translation, *pose.center().tolist())))
-        for image, pose in sorted(poses.items())
-    )
-    write_csv_table(path, (*columns, "center_x", "center_y", "center_z"), rows)
-
-
-def write_timing(path: Path, results: Iterable[LocalizationResult]) -> None:
-    rows = (
-        (result.name, step, f"{seconds:.5f}")
-        for result in results
-        for step, seconds in result.seconds.items()
-    )
-    write_csv_table(path, ("image", "step", "seconds"), rows)
-
-
-def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, str]:
-    """Remove unreadable images from a workspace's queries; write the reasons to ``tables``."""
-    folder = KaptureFolder(query)
-    data = folder.read()
-    names = data.image_names()
-    faults = work.map(partial(_fault, FolderSpec(folder)), names, "reading queries")
-    reasons = {name: fault for name, fault in zip(names, faults, strict=True) if fault}
-    if not reasons:
-        return {}
-    if len(reasons) == len(names):
-        # report the target of the link, as the link may be temporary
-        raise DataError(reasons[names[0]], path=Path(os.path.realpath(folder.image_path(names[0]))))
-    records = {key: name for key, name in data.records_camera.items() if name not in reasons}
-    write_sensors(query, replace(data, records_camera=records))
-    write_unreadable(tables, reasons)
-    return reasons
-
-
-def unreadable_queries(tables: Path) -> Iterator[Failure]:
-    for name, reason in read_unreadable(tables).items():
-        yield unreadable_image(name, reason)
-
-
-def unreadable_image(name: str, reason: str) -> Failure:
-    return Failure(f"the image cannot be used: {reason}", name=name)
-
-
-def _fault(spec: FolderSpec, name: str) -> str:
-    folder = spec.open()
-    try:
-        read_image_of(folder.image_path(name), folder.read().camera_of(name))
-    except DataError as error:
-        return error.message
-    return ""
-
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.values import MIN_CONFIDENCE, Failure, Fallback, Options, Pose, RigidTransform
 
 _FIRST_TURN = 8  # candidates that are matched first; each further turn doubles their number
 # with fewer inliers even a correct pose can be off by decimetres, and matching more candidates

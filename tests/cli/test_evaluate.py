@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.evaluation.pose_files import write_pose_file
+from megloc_kapture.evaluation.pose_files import format_pose_file
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
@@ -85,7 +85,7 @@ def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path, tmp_pa
     assert (out / "recall.txt").read_text() == done.out.removesuffix("\n")
     # a pose file may be one of them
     poses = tmp_path / "poses.txt"
-    write_pose_file(poses, poses_off(0.01, 2), names="basename")
+    poses.write_text(format_pose_file(poses_off(0.01, 2), names="basename"))
     done = megloc(*results(runs, "a"), "-i", poses, "--gt", runs / "a/query_gt")
     assert "/poses.txt localize the same 38 queries" in " ".join(done.out.split())
 
@@ -163,7 +163,7 @@ def poses(scene: Path) -> Poses:
 @pytest.fixture
 def place(poses: Poses, tmp_path: Path) -> Path:
     """A correct pose file."""
-    write_pose_file(tmp_path / "poses.txt", poses)
+    (tmp_path / "poses.txt").write_text(format_pose_file(poses))
     return tmp_path / "poses.txt"
 
 
@@ -187,7 +187,7 @@ def test_a_correct_pose_file_has_no_problem(megloc: Any, aachen: Path, place: Pa
 
 @pytest.mark.usefixtures("aachen")
 def test_problems_of_a_pose_file_are_listed(megloc: Any, poses: Poses, place: Path) -> None:
-    write_pose_file(place, {name: pose.inverse() for name, pose in poses.items()})
+    place.write_text(format_pose_file({name: pose.inverse() for name, pose in poses.items()}))
     with place.open("a") as file:
         file.write("stranger.jpg 1 0 0\n")
     done = megloc("check", "aachen", place)

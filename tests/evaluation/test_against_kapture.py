@@ -16,7 +16,7 @@ from tools.kapture_export_LTVL2020 import export_ltvl
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.metrics import Threshold, thresholds_from_pairs
-from megloc_kapture.evaluation.pose_files import read_pose_file, write_pose_file
+from megloc_kapture.evaluation.pose_files import format_pose_file, read_pose_file
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
@@ -165,7 +165,7 @@ def test_kaptures_exporter_gives_the_same_poses(
 ) -> None:
     theirs_path, ours_path = tmp_path / "theirs.txt", tmp_path / "ours.txt"
     export_ltvl(str(localized), str(theirs_path), full, False, False, False)
-    write_pose_file(ours_path, KaptureFolder(localized).read().poses(), names=names)
+    ours_path.write_text(format_pose_file(KaptureFolder(localized).read().poses(), names=names))
     ours, theirs = read_pose_file(ours_path), read_pose_file(theirs_path)
     assert len(ours) == 36 and sorted(ours) == sorted(theirs)
     quats, translations = stack_poses(ours[name] for name in ours)

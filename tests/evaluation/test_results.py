@@ -16,7 +16,7 @@ from scored import write_kapture
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.pose_files import write_pose_file
+from megloc_kapture.evaluation.pose_files import format_pose_file
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
 from megloc_kapture.evaluation.results import (
     context_of,
@@ -98,7 +98,7 @@ def test_results_in_other_local_frames(world: Any, tmp_path: Path) -> None:
     truth = write_kapture(tmp_path / "one/query_gt", names, world.truth)
     folder = write_kapture(tmp_path / "one/localized", names, world.estimated)
     moved_folder = write_kapture(tmp_path / "two/localized", names, moved)
-    write_pose_file(tmp_path / "poses.txt", official)
+    (tmp_path / "poses.txt").write_text(format_pose_file(official))
     actual = evaluate_results(
         [folder, moved_folder, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
     )
@@ -137,13 +137,13 @@ def test_the_challenges_names_are_read_back(
     names = {name: f"rear/{number}.png" for number, name in enumerate(sorted(world.truth))}
     write_protocol(tmp_path / "megloc", protocol_of("robotcar"))
     write_names(tmp_path / "megloc", names)
-    write_pose_file(tmp_path / "poses.txt", world.estimated, names=names)
+    (tmp_path / "poses.txt").write_text(format_pose_file(world.estimated, names=names))
     rules = benchmark_of(tmp_path / "megloc")
     (actual,) = evaluate_results([tmp_path / "poses.txt"], truth, rules)
     assert actual.row().num_missing == 4 and actual.without_truth == ()
     assert "RobotCar Seasons v2 publishes" in actual.truth_known_by
     # last parts of the path alone give the figures of the folder
-    write_pose_file(tmp_path / "poses.txt", world.estimated, names="basename")
+    (tmp_path / "poses.txt").write_text(format_pose_file(world.estimated, names="basename"))
     from_file, from_folder = evaluate(tmp_path / "poses.txt", truth), evaluate(result, truth)
     np.testing.assert_array_equal(from_file.errors.position_m, from_folder.errors.position_m)
     assert from_file.without_truth == ()
@@ -237,7 +237,7 @@ def test_colmap_models_are_truth_and_result(
 
 
 def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) -> None:
-    write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
+    (tmp_path / "poses.txt").write_text(format_pose_file({"other.jpg": RigidTransform.identity()}))
     with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
     with pytest.raises(DataError, match=r"'a.jpg': a ndarray is no pose; use RigidTransform"):

@@ -14,12 +14,9 @@ from kloc import kapture_tool, kloc, merged, needs_kapture_localization, pose_er
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.stages.image_pairs import QueryPairsOptions, Retrieval, pair_queries
+from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.query_poses import (
-    LocalizationOptions,
-    localize_from_matches,
-    write_localized,
-)
+from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 
 pytestmark = pytest.mark.slow
 

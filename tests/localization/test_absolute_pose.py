@@ -96,7 +96,9 @@ def test_the_threshold_and_the_least_number_of_inliers_are_options() -> None:
     assert located(result(max_error_px=12)).num_inliers > 90
     assert 50 <= located(result(max_error_px=3)).num_inliers < 60
     assert isinstance(result(max_error_px=3, min_inliers=70), Failure)
-    few = absolute_pose(pixels[:11], world[:11], PINHOLE)
+    exact, points = scene(PINHOLE, random_pose(rng), rng, 12)
+    assert located(absolute_pose(exact, points, PINHOLE)).num_inliers == 12
+    few = absolute_pose(exact[:11], points[:11], PINHOLE)
     assert not few and isinstance(few, Failure)
     assert few.reason == "11 2D-3D matches, at least 12 are needed"
 

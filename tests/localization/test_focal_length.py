@@ -30,7 +30,14 @@ from megloc_kapture.localization.focal_length import (
     solve_with_shared_camera,
 )
 from megloc_kapture.localization.map_index import PoseProblem, View
-from megloc_kapture.values import Camera, Failure, LocalizationResult, Pose, RigidTransform
+from megloc_kapture.values import (
+    Camera,
+    Failure,
+    LocalizationResult,
+    Pose,
+    PoseRefinement,
+    RigidTransform,
+)
 
 Floats = NDArray[np.float64]
 ALONE = RigidTransform.identity()
@@ -213,10 +220,11 @@ def test_a_shared_camera_improves_the_poses() -> None:
         assert "5 photographs" in pose.remarks[-1]
 
 
-def test_another_zoom_keeps_its_focal_length() -> None:
+def test_another_zoom_and_a_refined_pose_stay() -> None:
     poses = [photograph(seed, focal, 0.005)[0] for seed, focal in enumerate((1378, 1383, 1900))]
+    poses.append(replace(poses[1], refinements=(PoseRefinement(poses[1].cam_from_world),)))
     solved = solve_with_shared_camera(poses, OPTIONS)
-    assert solved[2] is poses[2]
+    assert solved[2] is poses[2] and solved[3] is poses[3]
     assert solved[0].camera != poses[0].camera
     for few in ([], poses[:1]):
         assert solve_with_shared_camera(few, OPTIONS) == few

@@ -57,6 +57,8 @@ def test_observations_of_each_image_ascend(rows: list[tuple[int, int, int]]) -> 
         keypoints, points = index.observed(name)
         assert list(zip(keypoints.tolist(), points.tolist(), strict=True)) == mine
     assert [len(part) for part in index.observed("not in the map.jpg")] == [0, 0]
+    times = [sum(point == p for _, _, p in rows) for point in range(20)]
+    assert index.seen_once.tolist() == [number == 1 for number in times]
 
 
 @given(observations, st.lists(st.sampled_from("abcdz"), max_size=6))

@@ -104,7 +104,7 @@ def test_an_image_must_fit_its_camera(corner: Map) -> None:
 
 def test_an_exact_map_is_consistent(corner: Map) -> None:
     exact = verdict(corner)
-    assert exact.consistent and exact.images == len(POSES)
+    assert not exact.reason and exact.images == len(POSES)
     assert exact.median.moved_m < 0.005 and exact.median.turned_deg < 0.08
 
 
@@ -127,7 +127,7 @@ def test_neither_unit_nor_frame_matters(corner: Map, scale: float, off_deg: floa
 
     moved = posed(corner, change)
     other = with_depth(moved, lambda view: {"depth_m": np.float32(scale) * view.depth_m})
-    assert verdict(other).consistent == (off_deg == 0.0)
+    assert (not verdict(other).reason) == (off_deg == 0.0)
 
 
 @SLOW
@@ -141,7 +141,7 @@ def test_images_with_a_shared_displacement_do_not_confirm_each_other() -> None:
         for scan, (x, y, z) in enumerate(centers)
         for k in range(3)
     }
-    assert verdict(scans).consistent
+    assert not verdict(scans).reason
     whole = displaced(HERE, 1, 0.02, 0.5)
     off = posed(scans, lambda k, each: each @ whole if k >= 3 else each)
     assert "6 of 6" in verdict(off).reason
@@ -186,14 +186,14 @@ def test_most_of_the_images_decide(wrong: list[bool]) -> None:
     values = [CHI2_OF_CHANCE * (1.01 if each else 0.99) for each in wrong]
     result = judge_consistency(map(known, values))
     assert (result.images, result.contradicting) == (len(wrong), sum(wrong))
-    assert result.consistent == (sum(wrong) <= len(wrong) / 2)
+    assert (not result.reason) == (sum(wrong) <= len(wrong) / 2)
     assert result.median.squared_distance == pytest.approx(np.median(values))
 
 
 def test_few_images_decide_nothing_and_many_are_not_used() -> None:
     few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
     assert "unknown" in few.reason and few.images == MIN_TESTED - 1
-    assert judge_consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
+    assert not judge_consistency([None, *[known(1.0)] * MIN_TESTED]).reason
     asked = iter([known(1.0)] * 100)
     assert judge_consistency(asked).images == MAX_TESTED
     assert len(list(asked)) == 100 - MAX_TESTED

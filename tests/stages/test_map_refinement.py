@@ -39,15 +39,7 @@ from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
 from megloc_kapture.mvs.views import Agreement
 from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.stages.densifying import (
-    DEPTH_FILE,
-    DensifyOptions,
-    densify_map,
-    fitted_to_poses,
-    fuse_depth,
-    read_beside,
-    side_file,
-)
+from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
 from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.map_refinement import (
     MapRefinementOptions,
@@ -55,6 +47,7 @@ from megloc_kapture.stages.map_refinement import (
     refine_map,
 )
 from megloc_kapture.stages.scene import depth_records, index_map, read_depth
+from megloc_kapture.stages.stereo_depth import DEPTH_FILE, fuse_depth, read_beside, side_file
 from megloc_kapture.values import Camera, RigidTransform
 
 FAST = PluginChoice(name="sweep", options={"passes": 1, "max_planes": 48})

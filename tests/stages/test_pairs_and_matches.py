@@ -30,14 +30,10 @@ from megloc_kapture.stages.image_pairs import (
     UNRESTRICTED,
     MappingPairsOptions,
     QueryPairsOptions,
-    RerankingOptions,
     Restrictions,
     Retrieval,
-    counted,
     pair_map_images,
     pair_queries,
-    rerank,
-    reranked,
     vectors_of,
 )
 from megloc_kapture.stages.matches import (
@@ -48,6 +44,7 @@ from megloc_kapture.stages.matches import (
     match_all,
     match_pairs,
 )
+from megloc_kapture.stages.reranking import RerankingOptions, counted, rerank, reranked
 from megloc_kapture.values import ImageFeatures
 
 VECTORS = {

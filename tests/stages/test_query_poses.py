@@ -38,13 +38,9 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PoseHypothesis, PoseRefinement, RankingScene
 from megloc_kapture.refinement.references import Displacement
 from megloc_kapture.stages.image_pairs import Restrictions
+from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
-from megloc_kapture.stages.query_poses import (
-    LocalizationOptions,
-    localize_query,
-    localize_unit,
-    write_localized,
-)
+from megloc_kapture.stages.query_poses import LocalizationOptions, localize_query, localize_unit
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform

@@ -40,7 +40,7 @@ Version = Literal["1.0", "1.1"]
 Wanted = Literal["auto", "1.0", "1.1"]
 
 DAY, NIGHT = "day", "night"
-DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER = "db", "sequences", "query"
+DATABASE_FOLDER, SEQUENCES_FOLDER = "db", "sequences"
 # night queries that v1.1 adds to those of v1.0
 ADDITIONAL_NIGHT = "query/night/nexus5x_additional_night/"
 

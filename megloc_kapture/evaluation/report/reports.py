@@ -28,11 +28,7 @@ from megloc_kapture.evaluation.comparison import (
 )
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.report import content
-from megloc_kapture.evaluation.report.queries import (
-    StoredInliers,
-    shown_queries,
-    worst_queries,
-)
+from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries, worst_queries
 from megloc_kapture.evaluation.results import Poses, first_map_poses
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult, Reported
 from megloc_kapture.io.files import write_bytes, write_json

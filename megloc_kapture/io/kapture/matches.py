@@ -23,12 +23,7 @@ from megloc_kapture.io.kapture.features import (
     blob_sources,
     feature_folder,
 )
-from megloc_kapture.io.kapture.format import (
-    check_columns,
-    check_field,
-    format_table,
-    read_rows,
-)
+from megloc_kapture.io.kapture.format import check_columns, check_field, format_table, read_rows
 from megloc_kapture.io.text_lines import numbers_of
 
 _BETWEEN = ".overlapping/"
