@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -102,6 +103,8 @@ def test_the_five_conventions(check: Check, scene: Callable[..., Poses]) -> None
         wrong = {name: convert(pose) for name, pose in poses.items()}
         error = only(check(lines_of(wrong), reference))
         assert (error.severity, error.kind) == ("error", "convention") and words in error.message
+        shares = re.search(r", (\d+)% of .* but only (\d+)% as they are", error.message)
+        assert shares is not None and int(shares[1]) > int(shares[2])
 
 
 def test_a_recentred_map(check: Check) -> None:

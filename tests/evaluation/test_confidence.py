@@ -19,7 +19,9 @@ def test_calibration_error() -> None:
     rng = np.random.default_rng(0)
     claimed = rng.uniform(0, 1, 200_000)
     right = rng.uniform(0, 1, 200_000) < claimed
-    assert calibration_error(reliability(claimed, right)) < 0.01
+    bins = reliability(claimed, right)
+    assert calibration_error(bins) < 0.01
+    assert all(bin.low < bin.mean_confidence < bin.high for bin in bins)
     # and those that say half of it have an error of a quarter
     assert calibration_error(reliability(claimed / 2, right)) == pytest.approx(0.25, abs=0.01)
 

@@ -209,7 +209,7 @@ def test_localization_results_have_reasons_and_inliers(world: Any) -> None:
     assert actual.label == "mine"
 
 
-@pytest.mark.parametrize("kind", ["binary without points", "images.bin", "images.txt"])
+@pytest.mark.parametrize("kind", ["binary without points", "images.bin", "images.txt", "text"])
 def test_colmap_models_are_truth_and_result(
     world: Any, truth: Path, tmp_path: Path, kind: str
 ) -> None:
@@ -224,9 +224,9 @@ def test_colmap_models_are_truth_and_result(
         image = pycolmap.Image(image_id=number, name=f"above/{name}", camera_id=1)
         model.add_image_with_trivial_frame(image, rigid)
     (folder := tmp_path / "sparse" / "0").mkdir(parents=True)
-    if kind == "images.txt":
+    if kind in ("images.txt", "text"):
         model.write_text(str(folder))
-        source = folder / "images.txt"
+        source = folder / "images.txt" if kind == "images.txt" else tmp_path
     else:
         model.write_binary(str(folder))
         (folder / "points3D.bin").unlink()
