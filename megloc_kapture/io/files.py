@@ -12,6 +12,7 @@ import os
 import re
 import secrets
 import shutil
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -215,6 +216,19 @@ def link_as_text(path: Path) -> str:
     if file is None:
         return ""
     return f"; {file} is a file, perhaps a link that git or zip stored as text: make it a folder"
+
+
+def similar_name(path: Path) -> str:
+    """Return a remark if a file in the folder of ``path`` has almost this name, else ""."""
+
+    def plain(name: str) -> str:
+        return unicodedata.normalize("NFC", name).casefold()
+
+    with contextlib.suppress(OSError):
+        for name in os.listdir(path.parent):
+            if plain(name) == plain(path.name):
+                return f"; {name!r} differs in capitals, or in how accents are encoded (macOS)"
+    return ""
 
 
 def link_images(

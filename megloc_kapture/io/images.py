@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import focal_from_exif
-from megloc_kapture.io.files import link_as_text, read_content, reading, write_bytes
+from megloc_kapture.io.files import link_as_text, read_content, reading, similar_name, write_bytes
 from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
@@ -182,7 +182,9 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
 def check_image_file(path: Path) -> None:
     """Raise DataError unless the path is a file; its content is not checked."""
     with reading(path):
-        require(path.is_file(), f"no such image{link_as_text(path.parent)}", path=path)
+        if not path.is_file():
+            remark = link_as_text(path.parent) or similar_name(path)
+            raise DataError(f"no such image{remark}", path=path)
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:

@@ -182,3 +182,14 @@ def test_a_link_that_was_stored_as_text_is_named(tmp_path: Path) -> None:
         read_image_rgb(tmp_path / "images" / "a" / "1.jpg")
     with pytest.raises(DataError, match=r"no such image$"):
         read_image_rgb(tmp_path / "a" / "1.jpg")
+
+
+@pytest.mark.parametrize(
+    ("stored", "asked"), [("IMG_1.JPG", "img_1.jpg"), ("e\u0301.jpg", "é.jpg")]
+)
+def test_a_name_in_other_capitals_or_accents_is_named(
+    tmp_path: Path, stored: str, asked: str
+) -> None:
+    (tmp_path / stored).touch()
+    with pytest.raises(DataError, match=f"no such image; '{stored}' differs in capitals"):
+        read_image_rgb(tmp_path / asked)
