@@ -58,7 +58,7 @@ class TwoViewOptions(Options):
         default=4.0, gt=0, description="largest distance of an inlier from its epipolar line"
     )
     max_iterations: int = Field(
-        default=100,
+        default=50,
         gt=0,
         description="RANSAC iterations; use more for matchers with uninformative scores",
     )

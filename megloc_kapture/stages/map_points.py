@@ -234,7 +234,7 @@ class MakePoints(PipelineStage):
     """Triangulate the map's points, or backproject them from keypoints with depth maps."""
 
     name = "points"
-    version = 3
+    version = 4
     uses = ("map", "triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
     explained_by = ("map",)
     inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES, Layout.mapping_matches)
