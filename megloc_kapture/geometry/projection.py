@@ -188,17 +188,6 @@ def project_point(model, p, x, y, z, out):
 
 
 @compiled_loop
-def moved(r, t, points, k):
-    """Transform point ``k`` by rotation and translation, without slices or small arrays."""
-    px, py, pz = points[k, 0], points[k, 1], points[k, 2]
-    return (
-        r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + t[0],
-        r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + t[1],
-        r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + t[2],
-    )
-
-
-@compiled_loop
 def _project_all(model, p, points, out):
     for i in range(len(points)):
         project_point(model, p, points[i, 0], points[i, 1], points[i, 2], out[i])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays, project, scaled_camera
+from megloc_kapture.geometry.projection import draw_depth_surface
 from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -243,3 +244,21 @@ def test_points_that_only_the_depth_camera_sees_are_hidden() -> None:
 def test_no_sources_give_an_empty_view() -> None:
     view = warp_to_view([], CAMERAS[0], STILL)
     assert not view.valid.any() and (view.depth_m == 0).all() and (view.source == -1).all()
+
+
+@pytest.mark.parametrize("corners", [[(0, 0)], [(0, 2)], [(2, 2)], [(0, 0), (2, 0)]])
+@pytest.mark.parametrize("depth_m", [0.0, 5.0])
+def test_a_corner_without_depth_or_far_behind_costs_half_a_quad(
+    corners: list[tuple[int, int]], depth_m: float
+) -> None:
+    camera = Camera("PINHOLE", 3, 3, (3.0, 3.0, 1.5, 1.5))
+    depth = np.full((3, 3), 2.0, np.float32)
+    depth[tuple(np.transpose(corners))] = depth_m
+    rays = bearing_rays(camera, centres(camera))
+    drawn, front = draw_depth_surface(
+        depth, rays, STILL, scaled_camera(camera, 20.0), max_jump=0.1, near_m=0.1, field=9.0
+    )
+    # pixel centres of the depth map are 20 pixels apart
+    area = (4 - 0.5 * len(corners)) * 20 * 20
+    assert np.isfinite(drawn).sum() == pytest.approx(area, rel=0.02)
+    np.testing.assert_allclose(drawn[front], 2.0)
