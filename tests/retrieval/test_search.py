@@ -65,7 +65,7 @@ def test_fused_ranking_equals_whole_matrices(method: str) -> None:
     assert indices.shape == scores.shape == (7, 10)
     for row in range(7):
         matrices = [q[row : row + 1] @ m.T for q, m in zip(queries, database, strict=True)]
-        if options.fuses_ranks():
+        if method == "reciprocal_rank":
             ranks = [np.argsort(np.argsort(-m[0], kind="stable")) for m in matrices]
             shares = np.array(weights) / sum(weights)
             fused = sum(share / (61 + rank) for share, rank in zip(shares, ranks, strict=True))
