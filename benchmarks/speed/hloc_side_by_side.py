@@ -98,8 +98,8 @@ def ours(job: dict[str, Any]) -> dict[str, Any]:
         return KaptureFolder(first.root, features_dirs=[features, folder])
 
     # hloc bounds the distance in each image by 4 px, which is a Sampson distance of 4 / sqrt(2)
-    verified = KnownPoseOptions(max_error_px=4 / 2**0.5) if matcher else KnownPoseOptions()
-    map_matches = step("match map", lambda: match(mapping, map_pairs, verified))
+    bound = KnownPoseOptions(max_error_px=4 / 2**0.5) if matcher else KnownPoseOptions()
+    map_matches = step("match map", lambda: match(mapping, map_pairs, bound))
     output, options = folder / "map", TriangulationOptions()
     step("triangulation", lambda: triangulate_map(mapping, map_matches, TYPE, output, options))
     query_matches = step("match queries", lambda: match(query, query_pairs, TwoViewOptions()))

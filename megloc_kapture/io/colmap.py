@@ -149,8 +149,8 @@ def focal_from_matches(
 
 # COLMAP's defaults: reprojection error of an observation, and angle between the rays of a point
 _MAX_REPROJECTION_ERROR_PX, _MIN_ANGLE_DEG = 4.0, 1.5
-# relative decrease of the cost that ends an adjustment; COLMAP's 0 takes a third longer and moves
-# 1 % of the points by more than 1 mm in a room of several metres
+# relative decrease of the cost that ends an adjustment; with COLMAP's 0, triangulation takes 1.4
+# times as long on redkitchen_rgbd, and 99 % of the points differ by at most 1 mm
 _FUNCTION_TOLERANCE = 1e-4
 
 

@@ -18,7 +18,7 @@ from pydantic import Field
 from megloc_kapture.errors import MeglocError, require
 from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.files import remove, safe_join
+from megloc_kapture.io.files import link_images, link_records, remove, safe_join
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
@@ -56,7 +56,6 @@ from megloc_kapture.stages.stereo_depth import (
     FOLDER,
     LiftedPoints,
     depth_path,
-    link_images_and_masks,
     side_file,
     with_depth_sensors,
     write_points,
@@ -165,7 +164,7 @@ def densify_map(
         remove(jobs[0].scratch)
     rows = [replace(row, fill=fills.get(row.image, 0.0)) for row in rows]
     write_sensors(output, with_depth_sensors(data, [job.image for job in done], fit.max_size_px))
-    link_images_and_masks(source, output)
+    _link_images_and_masks(source, output)
     copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
     write_depth_rows(output / DEPTH_FILE, rows)
@@ -177,6 +176,12 @@ def densify_map(
         "max_size_px": fit.max_size_px,
         "map_error_px": round(fit.error_px, 4),
     }
+
+
+def _link_images_and_masks(source: KaptureFolder, output: Path) -> None:
+    records = source.root / "sensors" / "records_data"
+    link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
+    link_images(source.root, output, ("masks",))
 
 
 def _check(source: KaptureFolder, data: KaptureData) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import require
-from megloc_kapture.io.files import link_images, link_records, safe_join
+from megloc_kapture.io.files import safe_join
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -111,12 +111,6 @@ def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: in
             extended.trajectories[timestamp, sensor] = pose
         extended.records_depth[timestamp, sensor] = depth_path(image)
     return extended
-
-
-def link_images_and_masks(source: KaptureFolder, output: Path) -> None:
-    records = source.root / "sensors" / "records_data"
-    link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
-    link_images(source.root, output, ("masks",))
 
 
 def write_points(
