@@ -301,7 +301,7 @@ def test_path_costs_equal_the_minimum_over_label_sequences(direction: tuple[int,
 
 
 def test_the_best_label_is_the_minimum_of_the_parabola() -> None:
-    truth = np.array([[2.3, 5.0, 6.75]])
+    truth = np.array([[0.0, 2.3, 5.0, 6.75, 8.0]])  # no parabola at the first and last label
     labels = np.arange(9)
     total = (100 * (labels - truth[..., None]) ** 2).round().astype(np.uint16)
     result = np.empty(truth.shape)

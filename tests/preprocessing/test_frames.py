@@ -95,6 +95,16 @@ def test_cameras_are_scaled_with_their_images(camera: Camera, size: tuple[int, i
     assert scaled.model == (camera if twice else with_two_focals(camera)).model
 
 
+def test_an_estimated_camera_is_that_of_the_original_image() -> None:
+    original = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 321.0, 243.0, 0.02))
+    plan = plan_frame(original, FrameOptions(max_size_px=320))
+    estimated = Camera("SIMPLE_RADIAL", 320, 240, (275.0, 163.5, 119.5, 0.03), focal_deviation=0.01)
+    expected = Camera("SIMPLE_RADIAL", 640, 480, (550.0, 327.0, 239.0, 0.03), focal_deviation=0.01)
+    camera = plan.original_of(estimated)
+    assert replace(camera, params=expected.params) == expected
+    np.testing.assert_allclose(camera.params, expected.params, rtol=1e-12)
+
+
 def test_cropping_keeps_pixels_and_shrinking_averages_them() -> None:
     image = painted(lambda x, y: x + y / 2, 123, 61)
     camera = Camera("SIMPLE_RADIAL", 123, 61, (100.0, 60.0, 30.0, 0.1))
