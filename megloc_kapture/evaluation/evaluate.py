@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -186,6 +187,13 @@ def results_without_truth(
     map_poses = first_map_poses(contexts) if benchmark.pairs else {}
     known = {image for context in contexts for image in context.query_images()}
     read = _read(results, benchmark, contexts, labels, known, map_poses)
+    named = [result for result in read if result.images]
+    for first, other in pairwise(named):
+        require(
+            not {*first.images}.isdisjoint(other.images),
+            f"no query in common: {first.label} has {first.images[0]!r}, {other.label} has "
+            f"{other.images[0]!r}",
+        )
     queries = set(benchmark.names) or {pair.query for pair in benchmark.pairs}
     if not queries:
         of_results = {image for result in read for image in result.images}
@@ -201,13 +209,15 @@ def _read(
     images: Collection[str],
     references: Poses,
 ) -> list[Result]:
-    read = []
+    read: list[Result] = []
     for source, label, context in zip(results, labels or _labels(results), contexts, strict=True):
         if isinstance(source, Mapping):
             result = result_in_memory(source, label=label)
         else:
+            # without known names, pose files may spell those of the first result differently
+            names = images or (read[0].images if read else ())
             result = read_result(
-                source, benchmark, images=images, references=references, label=label
+                source, benchmark, images=names, references=references, label=label
             )
         read.append(replace(result, context=context))
     return read

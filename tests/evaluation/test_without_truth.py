@@ -125,6 +125,20 @@ def test_empty_or_equal_labels_are_refused(first: Result) -> None:
             evaluate_without_truth(results)
 
 
+def test_pose_files_may_spell_the_same_queries_differently(tmp_path: Path) -> None:
+    row = " 1 0 0 0 1.5 -0.2 3\n"
+    first, second, other = (tmp_path / name for name in ("first.txt", "second.txt", "other.txt"))
+    first.write_text(f"d/1.jpg{row}d/2.jpg{row}")
+    second.write_text(f"1.png{row}/data/d/2.jpg{row}")
+    other.write_text(f"9.jpg{row}")
+    result = results_without_truth([first, second], Benchmark())
+    assert result.agreement[0].num_both == result.agreement[0].num_queries == 2
+    with pytest.raises(
+        DataError, match=r"no query in common: first.* 'd/1\.jpg', other.* '9\.jpg'"
+    ):
+        results_without_truth([first, other], Benchmark())
+
+
 def test_from_a_workspace(first: Result, tmp_path: Path) -> None:
     workspace = tmp_path / "workspace"
     write_kapture(workspace / "mapping", list(MAP), MAP)
