@@ -76,7 +76,8 @@ def localized(
         )
         for seed in seeds
     }
-    queries = list(KaptureQueries(KaptureFolder(Path(folders[1])), kapture_map))
+    folder = KaptureQueries(KaptureFolder(Path(folders[1])), kapture_map)
+    queries = [folder.query(name) for name in folder.names]
     for original in queries[::every]:
         query = with_features(original, localizers[seeds[0]])
         MATCHES.clear()

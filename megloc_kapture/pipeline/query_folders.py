@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -54,7 +55,11 @@ from megloc_kapture.stages.local_features import check_lengths, mask_path
 from megloc_kapture.stages.scene import depth_of
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
 
+_log = logging.getLogger(__name__)
+
 FRAMES_EVERY = 30
+# features of at most so many queries are compared with the image size, and from so many keypoints
+_QUERIES_COMPARED, _MIN_COMPARED = 10, 100
 _LIST_SUFFIXES = (".txt", ".csv")
 
 
@@ -166,6 +171,8 @@ class KaptureQueries(Queries):
         self._map.folder.check_features_apart(self._folder)
         require(self.names, "there are no query images", path=self._folder.root)
         self._check_widths()
+        for local in self._local.values():
+            self._warn_of_other_size(local)
         errors = []
         for name in self.names:
             if any(name in local for local in self._local.values()):
@@ -234,15 +241,28 @@ class KaptureQueries(Queries):
                 path=self._folder.root,
             )
 
+    def _warn_of_other_size(self, local: _StoredType) -> None:
+        """Warn if the keypoints of all images span another size than the images."""
+        reach = []
+        for name in [name for name in self.names if name in local][:_QUERIES_COMPARED]:
+            with suppress(DataError):  # a broken file fails alone, with its query
+                pixels = local.keypoints.read(name)[:, :2]
+                size = np.array(self._sensor(name).params[1:3], np.float64)
+                if len(pixels) >= _MIN_COMPARED and size.all():
+                    reach.append(float((pixels / size).max()))
+        if reach and not 0.7 < max(reach) < 1.1:
+            message = (
+                "%s: keypoints of type %r reach to %.0f %% of the size of the query images; scale "
+                "them if they were extracted at another image size, or the poses are wrong"
+            )
+            _log.warning(message, self._folder.root, local.keypoints.type_name, 100 * max(reach))
+
     def types_of_all(self) -> list[str]:
         return [
             name
             for name, vectors in self._globals.items()
             if all(image in vectors for image in self.names)
         ]
-
-    def __iter__(self) -> Iterator[Query]:
-        return map(self.query, self.names)
 
     def query(self, name: str) -> Query:
         candidates: tuple[str, ...] | None = None

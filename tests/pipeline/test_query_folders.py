@@ -254,6 +254,23 @@ def test_cameras_are_scaled_to_smaller_images(
     assert "scaled to their images" in caplog.text
 
 
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_keypoints_of_images_of_another_size_are_reported(
+    queries: tuple[KaptureMap, KaptureFolder],
+    workspace: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    scale: float,
+) -> None:
+    opened, folder = queries
+    features = tmp_path / "features" / "local_features"
+    shutil.copytree(workspace / "local_features" / "rootsift", features / "rootsift")
+    for path in features.rglob("*.kpt"):
+        (np.fromfile(path, np.float32) * np.float32(scale)).tofile(path)
+    KaptureQueries(KaptureFolder(folder.root, features_dirs=[features.parent]), opened).check()
+    assert ("extracted at another image size" in caplog.text) == (scale != 1.0)
+
+
 def test_other_spellings_of_a_type_are_recognised(
     queries: tuple[KaptureMap, KaptureFolder], workspace: Path, tmp_path: Path
 ) -> None:
