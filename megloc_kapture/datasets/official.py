@@ -48,11 +48,12 @@ class DatasetCard(Options):
     layout: str
 
     def without(self, root: Path, absent: Sequence[str]) -> DataError:
-        return DataError(
-            f"not {self.title}, no folder {' and '.join(absent)}; the root must contain "
-            f"{self.layout}",
-            path=root,
-        )
+        inner = (path.parent for path in sorted(root.glob(f"*/{absent[0]}")))
+        nested = next((path for path in inner if all((path / n).is_dir() for n in absent)), None)
+        remedy = f"the root must contain {self.layout}"
+        if nested is not None:
+            remedy = f"there is one in {nested.name}/: give it as the root, or move it up"
+        return DataError(f"not {self.title}, no folder {' and '.join(absent)}; {remedy}", path=root)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +100,12 @@ class Missing:
             return
         parts = self.by_folder()
         more = len(parts) - _MISSING_SHOWN
+        # archives are often extracted one folder too deep
+        moved = next(self.root.rglob(f"{self.files[0].parent.name}/{self.files[0].name}"), None)
         raise DataError(
             f"{len(self.files)} files are missing: {', '.join(parts[:_MISSING_SHOWN])}"
             + (f", and files of {more} more folders" if more > 0 else "")
+            + (f"; {moved.name} is at {self._shown(moved.parent)}/" if moved else "")
             + "; --allow-missing imports the rest",
             path=self.root,
         )

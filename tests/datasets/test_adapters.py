@@ -69,6 +69,23 @@ def test_a_folder_without_the_layout_is_refused(
         adapter.check(tmp_path / "absent")
 
 
+@pytest.mark.parametrize("dataset", ["aachen", "robotcar", "4seasons"])
+def test_a_layout_one_folder_deeper_is_named(layouts: Path, tmp_path: Path, dataset: str) -> None:
+    shutil.copytree(layouts / dataset, tmp_path / "zip" / dataset)
+    adapter: Any = load_plugin(DATASETS, dataset, {})
+    with pytest.raises(DataError, match=f"there is one in {dataset}/: give it as the root"):
+        adapter.check(tmp_path / "zip")
+
+
+def test_missing_files_one_folder_deeper_are_named(layouts: Path, tmp_path: Path) -> None:
+    root = without(layouts, "robotcar", tmp_path)
+    (root / "images" / "night").rename(tmp_path / "night")
+    shutil.copytree(tmp_path / "night", root / "images" / "night" / "night")
+    missing = load_plugin(DATASETS, "robotcar", {}).read(root, allow_missing=True).missing
+    with pytest.raises(DataError, match=f"{ts(13)}.jpg is at images/night/night/left/; --allow"):
+        missing.refuse()
+
+
 @pytest.mark.parametrize(
     ("dataset", "gone", "message", "map_images", "queries"),
     [

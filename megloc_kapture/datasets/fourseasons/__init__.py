@@ -229,9 +229,11 @@ def find_recordings(root: Path) -> dict[str, Recording]:
         for folder in _folders(root)
         if any((folder / mark).exists() for mark in _MARKS)
     }
-    require(
-        recordings, f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it", path=root
-    )
+    if not recordings:
+        deeper = next(root.glob(f"*/*/{_IMAGES}"), None)
+        hint = f"; there is one in {deeper.parents[1].name}/: give it as the root" if deeper else ""
+        reason = f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it{hint}"
+        raise DataError(reason, path=root)
     return recordings
 
 
