@@ -104,7 +104,11 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     poses: dict[str, RigidTransform | None] = {}
     for number, fields in rows:
         with named(path, number):
-            require(len(fields) == 8, f"{len(fields)} columns instead of 8 ({COLUMNS})")
+            require(
+                len(fields) == 8,
+                f"{len(fields)} columns instead of 8 ({COLUMNS}); write such rows of "
+                "cam_from_world if this is another form (KITTI, 7-Scenes, Cambridge Landmarks)",
+            )
             name = fields[0].replace("\\", "/")
             require(name not in poses, f"{name!r} is given twice")
             values = [parse_number(field) for field in fields[1:]]
@@ -131,7 +135,7 @@ def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
 def _fields(line: str) -> list[str]:
     """Split a row at blanks, or at commas or semicolons, as spreadsheets write it."""
     for separator in ",;":
-        fields = [field.strip() for field in line.split(separator)]
+        fields = [field.strip(' \t\r"') for field in line.split(separator)]
         if len(fields) >= 8 and not any(" " in field for field in fields[1:]):
             return fields
     return line.split()
@@ -231,8 +235,9 @@ def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> Rigid
         qw, qx, qy, qz, tx, ty, tz = numbers
         require(
             abs(math.hypot(*numbers[3:]) - 1) > 0.01 or abs(math.hypot(*numbers[:4]) - 1) < 0.01,
-            f"{whose}: the quaternion is last, as in trajectories (TUM, EuRoC) of world_from_cam; "
-            "a pose file has it first, w x y z, and cam_from_world",
+            f"{whose}: the quaternion is last, as in trajectories (TUM, EuRoC) of world_from_cam, "
+            "which `megloc export tum` and evo compare, and as in Cambridge Landmarks (camera "
+            "centre, then w x y z); a pose file has it first, w x y z, and cam_from_world",
         )
     return checked_pose((qw, qx, qy, qz), (tx, ty, tz), whose)
 

@@ -115,7 +115,8 @@ def read_observations(path: Path) -> dict[str, Observations]:
             raise DataError("not a text file in UTF-8") from error
         except (ValueError, OverflowError) as error:
             message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, with ids of 0 or more"
-            raise DataError(message) from error
+            remedy = "upgrade kapture 1.0, which has no type, with kapture_upgrade_1_0_to_1_1"
+            raise DataError(f"{message}; {remedy}") from error
     if not blocks:
         return {}
     points, type_ids, image_ids, keypoints = (

@@ -56,7 +56,7 @@ def read_kapture_data(root: Path) -> KaptureData:
         raise DataError(
             "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
             "--images` localizes them, `megloc map` makes a map of them. Poses? `megloc evaluate` "
-            "takes pose files and COLMAP models",
+            "takes a file with rows name qw qx qy qz tx ty tz of cam_from_world, or a COLMAP model",
             path=root,
         )
     paths = {
@@ -168,7 +168,7 @@ def _record_key(
     require(re.fullmatch("[+-]?[0-9]+", fields[0]), f"timestamp {fields[0]!r} is not an integer")
     key = (int(fields[0]), fields[1])
     if key[1] not in devices:
-        raise DataError(f"unknown sensor or rig {key[1]!r}")
+        raise DataError(f"unknown sensor or rig {key[1]!r}: list it, or delete its rows")
     if key in known:
         raise DataError(f"timestamp {key[0]} of {key[1]!r} is listed twice")
     return key
