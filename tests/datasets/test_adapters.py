@@ -100,6 +100,7 @@ def test_missing_files_one_folder_deeper_are_named(layouts: Path, tmp_path: Path
         ("inloc", f"{CUTOUTS}/DUC1/024/DUC_cutout_024_30_0.jpg", "DUC_cutout_024_30_0.jpg", 71, 3),
         ("inloc", f"{CUTOUTS}/DUC1/024/DUC_cutout_024_0_0.jpg.mat", "0_0.jpg.mat", 72, 3),
         ("inloc", f"{CUTOUTS}/DUC2", f"{CUTOUTS}/DUC2", 36, 3),
+        ("inloc", f"{CUTOUTS}/DUC2/024", f"{CUTOUTS}/DUC2/<scans>", 36, 3),
         ("inloc", "database/alignments/DUC2/transformations/DUC_trans_024.txt", "trans", 36, 3),
     ],
 )

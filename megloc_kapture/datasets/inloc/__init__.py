@@ -33,7 +33,7 @@ LAYOUT = (
 )
 
 # folder names in archives and redistributions, most official first
-_ROOTS = ("", "dataset")
+_ROOTS = ("", "dataset", "InLoc")
 _CUTOUTS = ("database/cutouts", "cutouts", "database/cutouts_imageonly", "cutouts_imageonly")
 _ALIGNMENTS = ("database/alignments", "alignments")
 _QUERIES = ("query/iphone7", "queries/iphone7", "iphone7")
@@ -139,9 +139,6 @@ class Layout:
             return cls(cutouts, alignments, query)
         raise DataError(f"{_CUTOUTS[0]}/ is missing; the layout of InLoc is {LAYOUT}", path=root)
 
-    def alignment(self, floor: str) -> Path:
-        return self.alignments / floor
-
     def queries(self) -> list[str]:
         return [name for name in _listed(self.query) if name.lower().endswith(_PHOTOGRAPH)]
 
@@ -149,14 +146,16 @@ class Layout:
         folder = self.cutouts / floor
         if not missing.require(folder):
             return []
-        return [
+        scans = [
             self._scan(floor, number, missing)
             for number in _listed(folder)
             if _SCAN.fullmatch(number) and (folder / number).is_dir()
         ]
+        missing.files += [] if scans else [folder / "<scans>"]
+        return scans
 
     def wrong_scans(self, floor: str) -> frozenset[str]:
-        path = _first(self.alignment(floor), _WRONG_SCANS)
+        path = _first(self.alignments / floor, _WRONG_SCANS)
         return frozenset() if path is None else read_wrong_scans(path)
 
     def _scan(self, floor: str, number: str, missing: Missing) -> Scan:
@@ -172,7 +171,7 @@ class Layout:
         }
         missing.files += [folder / image for image in sorted((expected | points) - images)]
         first = Cutout(building, number, 0, 0)
-        transformation = self.alignment(floor) / "transformations" / first.transformation
+        transformation = self.alignments / floor / "transformations" / first.transformation
         missing.require(transformation)
         return Scan(floor, number, folder, tuple(cutouts), frozenset(points), transformation)
 
