@@ -187,8 +187,7 @@ def results_without_truth(
     map_poses = first_map_poses(contexts) if benchmark.pairs else {}
     known = {image for context in contexts for image in context.query_images()}
     read = _read(results, benchmark, contexts, labels, known, map_poses)
-    named = [result for result in read if result.images]
-    for first, other in pairwise(named):
+    for first, other in pairwise(result for result in read if result.images):
         require(
             not {*first.images}.isdisjoint(other.images),
             f"no query in common: {first.label} has {first.images[0]!r}, {other.label} has "

@@ -27,6 +27,7 @@ from megloc_kapture.io.dataset_tables import (
     read_world,
     unit_of,
 )
+from megloc_kapture.io.files import named
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.values import (
@@ -193,7 +194,8 @@ def read_result(
             _if_there(tables.read_status, path / tables.STATUS_FILE) or {},
             covariances=_if_there(tables.read_covariances, path / tables.COVARIANCE_FILE) or {},
         )
-    poses = pose_files.poses_by_image(read_poses(path), images, benchmark.names)
+    with named(path):
+        poses = pose_files.poses_by_image(read_poses(path), images, benchmark.names)
     if benchmark.world != World():
         poses = {image: benchmark.world.pose_in_local(pose) for image, pose in poses.items()}
     return Result(label, poses, tuple(sorted(poses)), confidences=pose_files.read_confidences(path))

@@ -137,6 +137,9 @@ def test_pose_files_may_spell_the_same_queries_differently(tmp_path: Path) -> No
         DataError, match=r"no query in common: first.* 'd/1\.jpg', other.* '9\.jpg'"
     ):
         results_without_truth([first, other], Benchmark())
+    first.write_text(f"d/9.jpg{row}n/9.jpg{row}")
+    with pytest.raises(DataError, match=r"other\.txt: '9\.jpg' may be"):
+        results_without_truth([first, other], Benchmark())
 
 
 def test_from_a_workspace(first: Result, tmp_path: Path) -> None:
