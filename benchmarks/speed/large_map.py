@@ -91,7 +91,7 @@ def generate(street: Street, folder: Path) -> None:
     for i, name in enumerate(street.names):
         if i not in needed:
             with open(descriptors / f"{name}.desc", "wb") as file:
-                file.truncate(NUM_KEYPOINTS * described.row_bytes)
+                file.truncate(NUM_KEYPOINTS * described.dsize * described.dtype.itemsize)
     images, rows, points = street.observations()
     observed = Observations(
         KEYPOINTS_TYPE, street.names, points, images.astype(np.int32), rows.astype(np.int32)

@@ -76,6 +76,8 @@ def checked_folders(
     check_images(mapping, map_data)
     _map_poses(mapping)
     require(query_data.records_camera, "there are no query images", path=query.root)
+    photographs = query.root / "sensors" / "records_data"
+    require(photographs.is_dir(), "no such folder, which has the images", path=photographs)
     renamed = map(prefixed(query_prefix), query_data.image_names())
     shared = sorted(set(map_data.image_names()) & set(renamed))
     if shared:
@@ -115,6 +117,8 @@ def import_kapture_folders(
         write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)
+    elif query_data.trajectories:
+        _log.warning("%s: has poses; only those in query_gt/ are taken for true poses", query.root)
     tables = _renamed_tables(read_side_tables(root / SIDE_TABLES), rename, map_data, query_data)
     if protocol_change is not None:
         tables = replace(tables, protocol=protocol_change(tables.protocol))

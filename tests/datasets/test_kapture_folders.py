@@ -71,6 +71,7 @@ def test_truth_is_optional_and_may_have_other_images(
     (root / "query_gt/sensors/sensors.txt").unlink()
     assert import_kapture_folders(root, tmp_path / "b")["queries_with_truth"] == 0
     assert not (tmp_path / "b" / "query_gt").exists()
+    assert "query: has poses; only those in query_gt/ are taken for true poses" in caplog.text
 
 
 @pytest.mark.parametrize("prefix", ["", "q"])
@@ -151,6 +152,12 @@ def test_a_map_without_poses_or_no_queries_are_refused(root: Path, tmp_path: Pat
         write_part(root, part, names, poses=False)
         with pytest.raises(DataError, match=message):
             import_kapture_folders(root, tmp_path / "out")
+
+
+def test_queries_without_images_are_refused(root: Path, tmp_path: Path) -> None:
+    shutil.rmtree(root / "query/sensors/records_data")
+    with pytest.raises(DataError, match="root/query/sensors/records_data: no such folder"):
+        import_kapture_folders(root, tmp_path / "out")
 
 
 def test_the_input_files_are_all_files_that_an_import_reads(root: Path) -> None:

@@ -70,10 +70,6 @@ class FeatureConfig:
         require(dtype in DTYPES.values(), f"dtype {dtype.name!r} is not of {', '.join(DTYPES)}")
         object.__setattr__(self, "dtype", dtype)
 
-    @property
-    def row_bytes(self) -> int:
-        return self.dsize * self.dtype.itemsize
-
 
 def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: bool) -> Path:
     parent = _types_folder(root, kind, orphan) / check_component(type_name)
@@ -296,7 +292,7 @@ class FeatureReader:
         return source.where(name)
 
     def _num_rows(self, size: int, source: BlobSource, name: str) -> int:
-        rows, rest = divmod(size, self.config.row_bytes)
+        rows, rest = divmod(size, self.config.dsize * self.config.dtype.itemsize)
         if rest or (self.kind == "global_features" and rows != 1):
             expected = "exactly one row" if self.kind == "global_features" else "whole rows"
             raise DataError(
