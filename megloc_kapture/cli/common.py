@@ -186,8 +186,10 @@ class Working(Common):
         self, output: Path, kind: str, *, force: bool, adds: bool = False
     ) -> Iterator[tuple[Path, Work]]:
         """Yield a staging folder, whose content moves to ``output`` on success, and the Work."""
+        read = () if adds else ("input", "query", "poses")
+        inputs = [getattr(self, name, None) for name in read]
         with (
-            staged_output(output, kind=kind, force=force, adds=adds) as out,
+            staged_output(output, kind=kind, force=force, adds=adds, inputs=inputs) as out,
             self.working(out) as work,
         ):
             yield out, replace(work, force=force)

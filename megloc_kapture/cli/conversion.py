@@ -92,7 +92,8 @@ class Import(Common):
             allow_missing=self.allow_missing,
         )
         choice.check()
-        with staged_output(self.output, kind=DATASET, force=self.force) as out:
+        inputs = (self.root,)
+        with staged_output(self.output, kind=DATASET, force=self.force, inputs=inputs) as out:
             counts = choice.import_to(self.root, out)
             work = Work(track=console.track)
             unreadable = set_aside_unreadable(out / QUERY, out / SIDE_TABLES, work)

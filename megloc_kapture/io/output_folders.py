@@ -73,14 +73,21 @@ def _write_mark(folder: Path, kind: str, names: Iterable[str] = ()) -> None:
 
 @contextlib.contextmanager
 def staged_output(
-    folder: Path, *, kind: str, force: bool = False, adds: bool = False
+    folder: Path,
+    *,
+    kind: str,
+    force: bool = False,
+    adds: bool = False,
+    inputs: Iterable[Path | str | None] = (),
 ) -> Iterator[Path]:
     """Yield a staging folder whose content moves to ``folder`` when the block succeeds.
 
     Files that the last command of this kind wrote are removed, unless ``adds`` is set. All other
-    files in ``folder`` are kept.
+    files in ``folder`` are kept. Raise OutputError if ``folder`` is one of the ``inputs``.
     """
     folder = Path(folder)
+    if folder.resolve() in {Path(path).resolve() for path in inputs if path is not None}:
+        raise OutputError(f"{folder}: is also an input, which would be lost; give another folder")
     check_claim(folder, kind=kind, force=force)
     place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
     staging = place / temporary_name()

@@ -262,7 +262,8 @@ def export(
     require(scene.images, "no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
-        with staged_output(output, kind=_KIND, force=force) as out:
+        inputs = (None if isinstance(map, KaptureMap) else map, query)
+        with staged_output(output, kind=_KIND, force=force, inputs=inputs) as out:
             if undistort:
                 export_undistorted(scene, out)
             elif name == "colmap":

@@ -87,7 +87,8 @@ class Results(Mapping[str, Pose | Failure]):
 
     def save(self, output: Path | str, *, force: bool = False) -> dict[str, int]:
         """Write a kapture folder with ``status.csv`` and, if enabled, fallbacks; return counts."""
-        with staged_output(Path(output), kind=LOCALIZED, force=force) as out:
+        inputs = (self.localizer.map.folder.root,)
+        with staged_output(Path(output), kind=LOCALIZED, force=force, inputs=inputs) as out:
             return self.write_to(out)
 
     def write_to(self, output: Path) -> dict[str, int]:

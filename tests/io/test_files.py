@@ -193,6 +193,15 @@ def test_files_of_another_kind_of_output_stay_when_forced(tmp_path: Path) -> Non
     assert names_in(place) == {"e", "f"}
 
 
+def test_an_output_that_is_an_input_is_refused_even_if_forced(tmp_path: Path) -> None:
+    (tmp_path / "map").mkdir()
+    (tmp_path / "link").symlink_to("map")
+    for place in (tmp_path / "map", tmp_path / "link"):
+        with pytest.raises(OutputError, match=f"{place}: is also an input"):
+            write_output(place, "a", force=True, inputs=(None, tmp_path / "map"))
+    assert names_in(tmp_path / "map") == set()
+
+
 @pytest.mark.parametrize("error", [DataError("broken"), KeyboardInterrupt()])
 def test_an_error_leaves_the_folder_unchanged(
     tmp_path: Path, foreign: Path, error: BaseException
