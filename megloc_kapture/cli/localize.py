@@ -27,7 +27,7 @@ from megloc_kapture.cli.common import (
     opened_map,
 )
 from megloc_kapture.datasets.kapture_folders import is_kapture
-from megloc_kapture.errors import DataError, OptionError, check_option, require
+from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
@@ -44,6 +44,8 @@ from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import LOCALIZED
+
+_log = logging.getLogger(__name__)
 
 _MIN_TOKEN_LENGTH = 16
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -106,7 +108,8 @@ class Localize(Reading, Deciding, Common):
                 f"folders, as in: {min(names)}, {min(images)}, 1.0",
                 path=self.pairs,
             )
-        with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
+        inputs = (path, self.query)
+        with staged_output(self.output, kind=LOCALIZED, force=self.force, inputs=inputs) as out:
             started = time.perf_counter()
             named = list(results.items())
             seconds = time.perf_counter() - started
@@ -224,9 +227,10 @@ def _options_of(command: Deciding) -> PipelineOptions:
 
 
 def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
-    """Raise DataError for an inconsistent map, unless forced."""
-    if not force and (fault := kapture_map.fault()):
-        raise DataError(f"{fault}; the poses would be wrong (--force localizes anyway)", path=path)
+    """Raise DataError for an inconsistent map; if forced, warn."""
+    if fault := kapture_map.fault():
+        require(force, f"{fault}; the poses would be wrong (--force localizes anyway)", path=path)
+        _log.warning("%s: %s; the poses may be wrong", path, fault)
 
 
 def _names(types: Sequence[LocalType]) -> str:

@@ -144,7 +144,7 @@ def test_without_any_localized_query_a_warning_is_printed_and_a_fallback_marked(
 
 
 def test_a_map_whose_points_contradict_its_keypoints_is_refused_unless_forced(
-    megloc: Any, foreign: Path, tmp_path: Path
+    megloc: Any, foreign: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = foreign / "map" / "reconstruction" / "points3d.txt"
     table = np.loadtxt(path, delimiter=",")
@@ -155,6 +155,7 @@ def test_a_map_whose_points_contradict_its_keypoints_is_refused_unless_forced(
     assert not (tmp_path / "localized").exists()
     assert re.search(r"FAULT +the points do not fit", megloc("info", foreign / "map").out)
     assert megloc(*command, "-f").status == 0
+    assert "the poses may be wrong" in caplog.text
     assert len(read_status(tmp_path / "localized" / "status.csv")) == 4
 
 
