@@ -219,7 +219,10 @@ def link_as_text(path: Path) -> str:
 
 
 def similar_name(path: Path) -> str:
-    """Return a remark if a file in the folder of ``path`` has almost this name, else ""."""
+    """Return a remark on a missing file: a broken link, or a file with almost this name; or ""."""
+    for link in (path, *path.parents):
+        if link.is_symlink() and not link.exists():
+            return f"; {link} is a link to {os.readlink(link)}, which is missing"
 
     def plain(name: str) -> str:
         return unicodedata.normalize("NFC", name).casefold()

@@ -184,6 +184,14 @@ def test_a_link_that_was_stored_as_text_is_named(tmp_path: Path) -> None:
         read_image_rgb(tmp_path / "a" / "1.jpg")
 
 
+def test_a_broken_link_is_named(tmp_path: Path) -> None:
+    (tmp_path / "images").symlink_to(tmp_path / "moved")
+    (tmp_path / "1.jpg").symlink_to("elsewhere.jpg")
+    for path, target in (("images/a/1.jpg", "moved"), ("1.jpg", "elsewhere.jpg")):
+        with pytest.raises(DataError, match=f"no such image; .* a link to .*{target}, which is"):
+            read_image_rgb(tmp_path / path)
+
+
 @pytest.mark.parametrize(
     ("stored", "asked"), [("IMG_1.JPG", "img_1.jpg"), ("e\u0301.jpg", "é.jpg")]
 )
