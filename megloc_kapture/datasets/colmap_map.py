@@ -10,6 +10,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,7 +25,7 @@ from megloc_kapture.io.colmap_model import (
     colmap_model_files,
     read_colmap_model,
 )
-from megloc_kapture.io.files import link_as_text, link_records
+from megloc_kapture.io.files import link_as_text, link_records, similar_name
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -146,10 +147,12 @@ class ColmapReconstruction:
                     f"{len(missing)} of the model's {len(names)} images are not here, the first "
                     f"is {missing[0]}"
                 )
+                remark = similar_name(source.images / missing[0])
                 # often in a subfolder, or converted to another format
                 alike = next(source.images.rglob(f"{PurePosixPath(missing[0]).stem}.*"), None)
-                if alike is not None:
-                    message += f" (but {alike.relative_to(source.images)} is)"
+                if not remark and alike is not None:
+                    remark = f" (but {alike.relative_to(source.images)} is)"
+                message += remark
                 if source.database is None:
                     raise DataError(
                         f"{message}; give their folder with `megloc import colmap --images`",
@@ -201,8 +204,11 @@ class ColmapReconstruction:
             "database of the model (--database), or images to extract them from (--images)",
             path=source.model,
         )
-        if not len(self.model.points):
-            _log.warning(_MAPPED_AGAIN, source.model, "the model has no points")
+        if not len(self.model.points.image_ids):
+            what = "points without tracks" if len(self.model.points) else "no points"
+            hint = "give `megloc import colmap` the images to make them from (--images)"
+            require(source.images, f"the model has {what}; {hint}", path=source.model)
+            _log.warning(_MAPPED_AGAIN, source.model, f"the model has {what}")
             return None
         if local_type is None:
             return self._write_with_sift(output, work)
@@ -225,7 +231,8 @@ class ColmapReconstruction:
             self.write_images(images)
             mapping = KaptureFolder(images, features_dirs=[sift])
             extractor = load_plugin(LOCAL_FEATURES, _SIFT)
-            extract_local_features([mapping], extractor, sift, work=work)
+            with naming_lasting_files(output, self.source.model):
+                extract_local_features([mapping], extractor, sift, work=work)
             try:
                 counts = move_points(KaptureFolder(reference), mapping, _SIFT, output)
             except DataError as error:
@@ -252,6 +259,17 @@ class ColmapReconstruction:
         if not self.renamed:
             return {"": images}
         return {new: images / old for old, new in self.names.items()}
+
+
+@contextmanager
+def naming_lasting_files(temporary: Path, model: Path) -> Iterator[None]:
+    """Make errors about a temporary file name the file that it links to, or else the model."""
+    try:
+        yield
+    except DataError as error:
+        file = Path(error.path or temporary).resolve()
+        lasts = not file.is_relative_to(temporary.resolve())
+        raise DataError(error.message, path=file if lasts else model) from error
 
 
 def _scaled_cameras(source: ColmapFolders, model: ColmapModel) -> dict[int, Camera]:

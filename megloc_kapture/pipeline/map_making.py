@@ -24,6 +24,7 @@ from megloc_kapture.datasets.colmap_map import (
     ColmapReconstruction,
     find_colmap,
     is_colmap,
+    naming_lasting_files,
 )
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
 from megloc_kapture.errors import DataError, OptionError, check_option, require
@@ -317,11 +318,8 @@ def import_colmap(
         read.write_images(images)
         workspace = Workspace(Path(scratch) / "workspace")
         stages = plan_map(KaptureFolder(images), options_of_preset(DEFAULT_PRESET))
-        try:
-            with workspace.lock(), single_threaded():
-                run_plan(stages, workspace, work)
-        except DataError as error:  # report the model, as the temporary workspace is deleted
-            raise DataError(error.message, path=source.model) from error
+        with naming_lasting_files(output, source.model), workspace.lock(), single_threaded():
+            run_plan(stages, workspace, work)
         for made in workspace.path(MAP).iterdir():
             made.rename(output / made.name)
     read.link_images(output)

@@ -307,6 +307,23 @@ def test_features_of_a_model_that_are_not_available(
     model.write_binary(source.model)
     assert import_colmap(find_colmap(room), tmp_path / "none") is None
     assert "sparse/0: the model has no points" in caplog.text
+    model.add_point3D(np.zeros(3), pycolmap.Track(), np.zeros(3, np.uint8))  # of a point cloud
+    model.write_binary(source.model)
+    for database in (None, source.database):
+        assert import_colmap(replace(source, database=database), tmp_path / "cloud") is None
+    assert "sparse/0: the model has points without tracks" in caplog.text
+    with pytest.raises(DataError, match="points without tracks; give .*--images"):
+        import_colmap(replace(source, images=None), tmp_path / "blind")
+
+
+def test_an_error_names_the_image_behind_a_temporary_link(room: Path, tmp_path: Path) -> None:
+    image = room / "images" / "0003.jpg"
+    content = image.read_bytes()
+    image.unlink()  # may be a link into the shared scene
+    image.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataError, match="truncated") as caught:
+        import_colmap(replace(find_colmap(room), database=None), tmp_path / "map")
+    assert caught.value.path == image
 
 
 # unsorted, with an image that is not imported
