@@ -186,8 +186,10 @@ def _link_images_and_masks(source: KaptureFolder, output: Path) -> None:
 
 def _check(source: KaptureFolder, data: KaptureData) -> None:
     check_points(source, "densify")
+    records = source.root / "sensors" / "records_data"
+    require(records.is_dir(), "the images of the map are missing", path=records)
     require(
-        not (source.root / "sensors" / "records_data" / FOLDER).exists(),
+        not (records / FOLDER).exists(),
         f"has images or depth maps in records_data/{FOLDER}",
         path=source.root,
     )

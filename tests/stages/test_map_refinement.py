@@ -199,6 +199,12 @@ def test_unsuitable_folders_are_refused(
         densify_map(world.mapping(), tmp_path / "a", OPTIONS)
     with pytest.raises(DataError, match="records_data/mvs"):
         densify_map(densified, tmp_path / "b", OPTIONS)
+    with pytest.raises(DataError, match="no kapture folder.*`megloc import colmap` makes a map"):
+        densify_map(KaptureFolder(tmp_path), tmp_path / "b", OPTIONS)
+    write_sensors(tmp_path / "blind", world.map().read())
+    shutil.copytree(world.map().root / "reconstruction", tmp_path / "blind" / "reconstruction")
+    with pytest.raises(DataError, match="records_data: the images of the map are missing"):
+        densify_map(KaptureFolder(tmp_path / "blind"), tmp_path / "b", OPTIONS)
     with pytest.raises(DataError, match="no densified map"):
         fuse_depth(world.map(), tmp_path / "c.ply", Agreement())
 

@@ -55,8 +55,9 @@ def read_kapture_data(root: Path) -> KaptureData:
             raise DataError(f"no kapture folder, but {inner} in it: give one of them", path=root)
         raise DataError(
             "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
-            "--images` localizes them, `megloc map` makes a map of them. Poses? `megloc evaluate` "
-            "takes a file with rows name qw qx qy qz tx ty tz of cam_from_world, or a COLMAP model",
+            "--images` localizes them, `megloc map` makes a map of them. A COLMAP model? `megloc "
+            "import colmap` makes a map of it. Poses? `megloc evaluate` takes a model, or "
+            "a file with rows name qw qx qy qz tx ty tz of cam_from_world",
             path=root,
         )
     paths = {
