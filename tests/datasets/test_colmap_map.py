@@ -296,7 +296,7 @@ def test_features_of_a_model_that_are_not_available(
     room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = find_colmap(room)
-    model = pycolmap.Reconstruction(source.model)
+    model: Any = pycolmap.Reconstruction(source.model)
     for image in model.images.values():
         for point in image.points2D:
             point.xy = point.xy + [5.3, 2.6]  # nowhere near SIFT's keypoints
