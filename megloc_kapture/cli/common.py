@@ -96,7 +96,8 @@ class Console:
 
 def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
     for folder in folders:
-        require(folder.is_dir(), "no such folder", path=folder)
+        reason = "is a file; a folder is needed" if folder.is_file() else "no such folder"
+        require(folder.is_dir(), reason, path=folder)
     return tuple(folders)
 
 

@@ -171,8 +171,10 @@ def check_image_size(path: Path, camera: Camera) -> None:
 
 
 def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> DataError:
+    turned = size == (camera.height, camera.width)
+    hint = "; cameras describe the pixels as stored, before EXIF rotates them" if turned else ""
     return DataError(
-        f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
+        f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}{hint}",
         path=path,
     )
 

@@ -93,7 +93,10 @@ def export_colmap(scene: Scene, output: Path) -> None:
     names = [image.name for image in scene.images]
     if len(set(names)) != len(names):
         twice = min(name for name in names if names.count(name) > 1)
-        raise DataError(f"image {twice!r} is in the map and the queries; COLMAP needs unique names")
+        raise DataError(
+            f"two images are named {twice!r}, in map and queries, or because / becomes _; COLMAP "
+            "needs unique names"
+        )
     images = [MapImage(i.name, i.camera, i.cam_from_world, i.keypoints_px) for i in scene.images]
     observed = [(image.rows, image.points) for image in scene.images]
     write_model(output, images, observed, scene.points[:, :3], scene.points[:, 3:])
@@ -213,15 +216,13 @@ def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
     fx, fy = camera.params[0], camera.params[0 if camera.model in ONE_FOCAL_MODELS else 1]
     distortion = camera.params[len(camera.params) - len(names) :]
     return {
-        **{
-            "camera_model": model,
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": fx,
-            "fl_y": fy,
-            "cx": cx,
-            "cy": cy,
-        },
+        "camera_model": model,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
         **dict(zip(names, distortion, strict=True)),
     }
 
@@ -262,7 +263,7 @@ def export(
     require(scene.images, "no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
-        inputs = (None if isinstance(map, KaptureMap) else map, query)
+        inputs = (map.folder.root if isinstance(map, KaptureMap) else map, query)
         with staged_output(output, kind=_KIND, force=force, inputs=inputs) as out:
             if undistort:
                 export_undistorted(scene, out)

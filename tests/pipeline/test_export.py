@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from megloc_kapture.cli.info import describe_sizes
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.pipeline.export import (
     PosedImage,
     Scene,
     export,
+    export_colmap,
     export_nerfstudio,
     export_tum,
     export_undistorted,
@@ -122,6 +123,8 @@ def test_images_that_a_format_cannot_store_are_refused(tmp_path: Path) -> None:
     two = image(Camera.pinhole(6, 4, 5), pose), image(Camera.pinhole(6, 4, 5), pose)
     with pytest.raises(DataError, match="share a timestamp"):
         export_tum(scene(*two), tmp_path / "a.tum")
+    with pytest.raises(DataError, match="two images are named 'a.jpg', .* because / becomes _"):
+        export_colmap(scene(*two), tmp_path / "model")
 
 
 def test_corners_of_a_frustum_project_to_those_of_the_image() -> None:
@@ -153,7 +156,10 @@ def test_cameras_and_keypoints_are_scaled_to_smaller_images(map_copy: Path, tmp_
     assert model.cameras[found.camera_id].width == camera.width // 2
     xy = np.array([point.xy for point in found.points2D])
     np.testing.assert_allclose(xy, keypoints[:, :2] / 2, atol=1e-3)
-    assert any("200x150, scaled from the 400x300" in text for text in describe_sizes(scaled.folder))
+    described = describe_sizes(scaled.folder)
+    assert any("200x150, scaled from the 400x300" in text for text in described)
+    with pytest.raises(OutputError, match="is also an input"):
+        export("colmap", map_copy, map=scaled, force=True)
     write_image(records / name, np.zeros((50, 50, 3), np.uint8))
     with pytest.raises(DataError, match=f"{name}: the image is 50x50, its camera says"):
         export("colmap", tmp_path / "refused", map=KaptureMap.open(map_copy))

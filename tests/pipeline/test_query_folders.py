@@ -81,6 +81,8 @@ def test_rotated_photographs_are_turned_without_a_given_camera(tmp_path: Path) -
     assert photos.names == ["1.jpg"]
     assert photos.query("1.jpg").read_image().shape == (48, 64, 3)
     assert photos.unreadable == {"2.jpg": "the image is 32x48, its camera says 64x48"}
+    upright = Photographs([tmp_path], Camera.pinhole(48, 64, 50))
+    assert upright.unreadable["1.jpg"].endswith("as stored, before EXIF rotates them")
     photos = Photographs([tmp_path])
     assert photos.query("1.jpg").read_image().shape == (64, 48, 3)
     photos.write_images(tmp_path / "out")
