@@ -63,7 +63,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             with self._reading():
                 for name, image_id in self._rows("SELECT name, image_id FROM images ORDER BY name"):
                     with named(path):
-                        name = check_relative(str(name).removeprefix("./"))
+                        name = check_relative(str(name).replace("\\", "/").removeprefix("./"))
                     self.images[name] = int(image_id)
         except BaseException:
             self._connection.close()

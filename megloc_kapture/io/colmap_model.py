@@ -203,7 +203,7 @@ def _images_for_pycolmap(path: Path, cameras: Path) -> tuple[str, dict[int, str]
             image_id = int(numbers_of(row[:9], IMAGE_COLUMNS.removesuffix(" NAME"))[0])
             require(image_id not in names, f"image id {image_id} is listed twice")
             require(row[8] in camera_ids, f"camera {row[8]} is not in {cameras.name}")
-        names[image_id] = row[9].replace("\\", "/")
+        names[image_id] = row[9]
         lines.append(f"{' '.join(row[:9])} {image_id}\n{features}\n")
     return "".join(lines), names
 
@@ -253,7 +253,7 @@ def _images(model: Any, path: Path, names: Mapping[int, str]) -> tuple[ColmapIma
             continue
         given = names.get(image_id, image.name)
         with named(path, about=f"image {given!r}"):
-            name = check_relative(given.removeprefix("./"))
+            name = check_relative(given.replace("\\", "/").removeprefix("./"))
             require(name not in images, "is listed twice")
             pose = _transform(image.cam_from_world())
         images[name] = ColmapImage(image_id, name, image.camera_id, pose)

@@ -473,6 +473,12 @@ def test_the_exact_name_takes_precedence_over_another_suffix(tmp_path: Path) -> 
 # ------------------------------------------------------------------ the database
 
 
+def test_backslashes_in_a_database_separate_folders(tmp_path: Path) -> None:
+    write_database(tmp_path / "d.db", {"db\\a.jpg": 10})
+    with ColmapDatabase(tmp_path / "d.db") as database:
+        assert list(database.images) == ["db/a.jpg"]
+
+
 def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "d.db"
     write_database(path, FEATURES)

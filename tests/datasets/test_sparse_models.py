@@ -274,6 +274,17 @@ def test_images_of_other_tools_are_read(tmp_path: Path, change: Callable[[str], 
     assert len({name.rpartition("/")[0] for name in names} & {"db", "my photos/day 1"}) == 1
 
 
+def test_backslashes_in_binary_files_separate_folders(tmp_path: Path) -> None:
+    texts = {"cameras": CAMERAS, "images": IMAGES.replace("db/", "db\\"), "points3D": ""}
+    for file, text in texts.items():
+        (tmp_path / f"{file}.txt").write_text(text)
+    pycolmap.Reconstruction(tmp_path).write_binary(tmp_path)
+    for text_file in tmp_path.glob("*.txt"):
+        text_file.unlink()
+    model = read_colmap_model(tmp_path)
+    assert [image.name for image in model.images] == ["db/7.jpg", "db/8.jpg"]
+
+
 def test_camera_models_that_kapture_lacks_are_refused_by_name(tmp_path: Path) -> None:
     model, params = "SIMPLE_DIVISION", (500.0, 320.0, 240.0, 0.01)
     camera = pycolmap.Camera(camera_id=1, model=model, width=640, height=480, params=params)
