@@ -7,7 +7,6 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,7 +35,6 @@ from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.live_source import LocalType
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.pipeline.query_folders import Photographs
@@ -117,7 +115,7 @@ class Localize(Reading, Deciding, Common):
         how = "as given"
         if given is None:
             how = localizer.matching.describe_candidates(queries.types_of_all())
-        console.say(f"localizing with {_names(localizer.types)}")
+        console.say(f"localizing with {', '.join(local.name for local in localizer.types)}")
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
         remarks = Counter(remark for _, result in named for remark in result.remarks)
@@ -231,7 +229,3 @@ def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> No
     if fault := kapture_map.fault():
         require(force, f"{fault}; the poses would be wrong (--force localizes anyway)", path=path)
         _log.warning("%s: %s; the poses may be wrong", path, fault)
-
-
-def _names(types: Sequence[LocalType]) -> str:
-    return ", ".join(local.name for local in types)
