@@ -60,7 +60,7 @@ from megloc_kapture.stages.stereo_depth import (
     with_depth_sensors,
     write_points,
 )
-from megloc_kapture.stages.work import HERE, FolderSpec, Work, is_out_of_memory
+from megloc_kapture.stages.work import HERE, Work, is_out_of_memory
 from megloc_kapture.values import Camera, Options
 
 _NO_POINTS = np.zeros(0, np.int64)
@@ -116,7 +116,7 @@ class StereoFit:
 
 @dataclass(frozen=True)
 class _Job:
-    folder: FolderSpec
+    folder: KaptureFolder
     scratch: Path
     out: Path
     image: str
@@ -258,7 +258,7 @@ def _plan(
     for row, key in enumerate(keys):
         members.setdefault(key, np.zeros(len(images), bool))[row] = True
     has_depth = depth_records(data)
-    spec, scratch = FolderSpec(source), output / f".{FOLDER}"
+    scratch = output / f".{FOLDER}"
     jobs, rows = [], []
     for row, image in enumerate(images):
         blank = DepthRow(image, (), 0.0, 0.0, 0.0, "")
@@ -281,7 +281,7 @@ def _plan(
             continue
         lifts = indices if options.mode == "points" else ()
         seen = {index.local_type: index.observed(image)[0] for index in lifts}
-        jobs.append(_Job(spec, scratch, output, image, sources, limits, fit, estimator, seen))
+        jobs.append(_Job(source, scratch, output, image, sources, limits, fit, estimator, seen))
         rows.append(replace(blank, sources=sources, near_m=limits[0], far_m=limits[1]))
     return jobs, rows
 
@@ -305,7 +305,7 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
 
 def _estimate(job: _Job) -> str:
     """Estimate an image's depth into the scratch folder; return the reason if it fails, else ""."""
-    folder, size = job.folder.open(), job.fit.max_size_px
+    folder, size = job.folder, job.fit.max_size_px
     try:
         views = [_view(folder, image, size) for image in (job.image, *job.sources)]
         estimate = job.estimator.estimate(views[0], views[1:], job.range_m)
@@ -323,7 +323,7 @@ def _estimate(job: _Job) -> str:
 
 def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
     """Write the depth that sources confirm; return its share of the pixels, and lifted points."""
-    folder, size = job.folder.open(), job.fit.max_size_px
+    folder, size = job.folder, job.fit.max_size_px
     view = _view(folder, job.image, size)
     names = ("depth", "sigma", "normals")
     estimate = DepthEstimate(*(np.load(_scratch(job, job.image, name)) for name in names))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,6 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import (
     HERE,
     Batched,
-    FolderSpec,
     Work,
     in_batches,
     ordered_map,
@@ -68,8 +68,8 @@ class VladSettings(Options):
     options: VladOptions
 
 
-def _descriptors(folder: FolderSpec, local_type: str, image: str) -> NDArray[Any]:
-    return folder.open().descriptors(local_type).read(image)
+def _descriptors(folder: KaptureFolder, local_type: str, image: str) -> NDArray[Any]:
+    return folder.descriptors(local_type).read(image)
 
 
 def vlad_type(local_type: str) -> str:
@@ -86,7 +86,7 @@ def train_on_map(
         f"the map has no descriptors of type {local_type}",
         path=mapping.root,
     )
-    read = partial(_descriptors, FolderSpec(mapping), local_type)
+    read = partial(_descriptors, mapping, local_type)
     each = partial(ordered_map, executor=work.executor)
     return train_vlad(images, descriptors.length, read, options, each=each)
 
@@ -111,11 +111,11 @@ def extract_vlad(
         vocabulary, _ = trained
     num_centres, size = vocabulary.centres.shape[1], vocabulary.size
     config = FeatureConfig(type_name, np.dtype(np.float32), size, metric_type="L2")
-    spec_of, folder_of = cache(FolderSpec), images_of(folders, "describe")
+    folder_of = images_of(folders, "describe")
     is_written = partial(has_features, output, "global_features", type_name)
-    todo = [(image, spec_of(folder_of[image])) for image in work.unfinished(folder_of, is_written)]
+    todo = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
     writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
-    describe = partial(_aggregate, local_type, place, FolderSpec(mapping).key)
+    describe = partial(_aggregate, local_type, place, uuid4().hex)
     results = work.map(describe, todo, resumed_label("VLAD", len(folder_of), len(todo)))
     for (image, _), vector in zip(todo, results, strict=True):
         writer.write(image, vector)
@@ -123,15 +123,15 @@ def extract_vlad(
 
 
 def _aggregate(
-    local_type: str, place: Path, run: tuple[object, ...], job: tuple[str, FolderSpec]
+    local_type: str, place: Path, run_id: str, job: tuple[str, KaptureFolder]
 ) -> NDArray[np.float32]:
-    vocabulary, settings = _read_once(place, run)
+    vocabulary, settings = _read_once(place, run_id)
     image, folder = job
     return aggregate(_descriptors(folder, local_type, image), vocabulary, settings.options)
 
 
 @lru_cache(maxsize=1)
-def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladSettings]:
+def _read_once(folder: Path, run_id: str) -> tuple[Vocabulary, VladSettings]:
     """Read a vocabulary once per process, as it may be too large to send with every image."""
     vocabulary = read_vocabulary(folder)
     assert vocabulary is not None

@@ -76,7 +76,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import BATCH, HERE, FolderSpec, Work, batched
+from megloc_kapture.stages.work import BATCH, HERE, Work, batched
 
 _log = logging.getLogger(__name__)
 
@@ -324,7 +324,7 @@ def pyramid_mapping(
         others[b][1].append(a)
 
     features = PyramidFeatures(output, mapping, local_type)
-    again = partial(_match_again, FolderSpec(mapping), local_type, method)
+    again = partial(_match_again, mapping, local_type, method)
     jobs = [(image, *others[image]) for image in sorted(others)]
     plugins = method.extractor, method.matcher
     results = work.map(again, jobs, "guided pyramid", plugins=plugins)
@@ -366,20 +366,20 @@ def pyramid_mapping(
 
 
 def _match_again(
-    mapping: FolderSpec,
+    mapping: KaptureFolder,
     local_type: str,
     method: PyramidMethod,
     job: tuple[str, Sequence[str], Sequence[str]],
 ) -> tuple[list[list[VariantMatches]], str]:
     image, others, only_scaled = job
-    folder, verification = mapping.open(), method.verification
+    verification = method.verification
     itself = cached_features(mapping, local_type, image)
 
     def judge(other: str, features: Features) -> PairVerifier:
         if verification is None:
             return UNVERIFIED
-        image_from_world = folder.read().cam_from_world(image)
-        other_from_world = folder.read().cam_from_world(other)
+        image_from_world = mapping.read().cam_from_world(image)
+        other_from_world = mapping.read().cam_from_world(other)
         assert image_from_world is not None and other_from_world is not None
         assert isinstance(verification, KnownPoseOptions)
         other_from_image = other_from_world @ image_from_world.inverse()
@@ -389,7 +389,7 @@ def _match_again(
 
     return match_image_again(
         itself,
-        *read_frame(folder, image, margin_px=method.mask_margin_px),
+        *read_frame(mapping, image, margin_px=method.mask_margin_px),
         others,
         partial(cached_features, mapping, local_type),
         judge,
@@ -428,7 +428,7 @@ def pyramid_queries(
         for image, others in candidates.items()
     ]
     features = PyramidFeatures(output, query, local_type)
-    retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
+    retry = partial(_retry, query, mapping, types, method)
     plugins = method.extractor, method.matcher
     tried: list[TriedPair] = []
     extended = 0
@@ -450,20 +450,20 @@ def pyramid_queries(
 
 
 def _retry(
-    query: FolderSpec,
-    mapping: FolderSpec,
+    query: KaptureFolder,
+    mapping: KaptureFolder,
     types: tuple[str, str],
     method: PyramidMethod,
     job: tuple[str, Sequence[str], Mapping[str, int]],
 ) -> RetriedQuery:
     image, candidates, num_found = job
-    folder, stored = query.open(), query.open().matches(types[0])
+    stored = query.matches(types[0])
     return retry_query(
         cached_features(query, types[0], image),
         [(other, *stored.read(image, other)) for other in candidates],
         partial(cached_features, mapping, types[1]),
         method,
-        lambda: read_frame(folder, image, margin_px=method.mask_margin_px),
+        lambda: read_frame(query, image, margin_px=method.mask_margin_px),
         num_found=num_found,
         name=image,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
 from operator import attrgetter, itemgetter
 from pathlib import Path
@@ -33,7 +33,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches, resumed_label
+from megloc_kapture.stages.work import HERE, Batched, Work, in_batches, resumed_label
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")
@@ -41,7 +41,7 @@ _SIZE = attrgetter("size")
 
 class _Job(NamedTuple):
     image: str
-    folder: FolderSpec
+    folder: KaptureFolder
     size: tuple[int, int]
     has_mask: bool
 
@@ -55,10 +55,10 @@ def extract_local_features(
     work: Work = HERE,
 ) -> dict[str, int]:
     """Write features of all images (orphan layout) without masked keypoints; return counts."""
-    spec_of, jobs = cache(FolderSpec), []
+    jobs = []
     for image, folder in images_of(folders, "extract features from").items():
         camera, has_mask = folder.read().camera_of(image), mask_path(folder, image).is_file()
-        jobs.append(_Job(image, spec_of(folder), (camera.width, camera.height), has_mask))
+        jobs.append(_Job(image, folder, (camera.width, camera.height), has_mask))
     is_written = partial(has_features, output, "descriptors", extractor.name)
     todo = work.unfinished(jobs, lambda job: is_written(job.image))
     todo.sort(key=_SIZE)  # images of equal size can share a batch
@@ -114,7 +114,7 @@ def _writers(
 
 
 def _read(margin_px: float, job: _Job) -> Frame:
-    return read_frame(job.folder.open(), job.image, margin_px=margin_px)
+    return read_frame(job.folder, job.image, margin_px=margin_px)
 
 
 def _extract(

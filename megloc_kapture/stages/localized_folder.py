@@ -26,7 +26,7 @@ from megloc_kapture.io.tables import (
 )
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.scene import poses_through_rig
-from megloc_kapture.stages.work import FolderSpec, Work
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Failure, Fallback, LocalizationResult, Pose, RigidTransform
 
 
@@ -127,7 +127,7 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     folder = KaptureFolder(query)
     data = folder.read()
     names = data.image_names()
-    faults = work.map(partial(_fault, FolderSpec(folder)), names, "reading queries")
+    faults = work.map(partial(_fault, folder), names, "reading queries")
     reasons = {name: fault for name, fault in zip(names, faults, strict=True) if fault}
     if not reasons:
         return {}
@@ -149,8 +149,7 @@ def unreadable_image(name: str, reason: str) -> Failure:
     return Failure(f"the image cannot be used: {reason}", name=name)
 
 
-def _fault(spec: FolderSpec, name: str) -> str:
-    folder = spec.open()
+def _fault(folder: KaptureFolder, name: str) -> str:
     try:
         read_image_of(folder.image_path(name), folder.read().camera_of(name))
     except DataError as error:

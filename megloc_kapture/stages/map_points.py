@@ -35,7 +35,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Work
 
 
 def triangulate_map(
@@ -171,7 +171,7 @@ def lift_map(
         "rig with camera and depth sensor)",
         path=mapping.root,
     )
-    spec, row_of = FolderSpec(mapping), {image: row for row, image in enumerate(images)}
+    row_of = {image: row for row, image in enumerate(images)}
     jobs = [(image, records[image]) for image in with_depth]
     points: list[NDArray[np.float64]] = []
     seen: dict[str, Observations] = {}
@@ -179,7 +179,7 @@ def lift_map(
     for local_type in local_types:
         image_ids: list[NDArray[np.int32]] = []
         keypoint_ids: list[NDArray[np.int32]] = []
-        lift = partial(_lift, spec, local_type)
+        lift = partial(_lift, mapping, local_type)
         results = work.map(lift, jobs, f"lifting {local_type}")
         for image, (lifted, ids) in zip(with_depth, results, strict=True):
             points.append(poses[image].inverse().apply(lifted))
@@ -200,15 +200,14 @@ def lift_map(
 
 
 def _lift(
-    spec: FolderSpec, local_type: str, job: tuple[str, DepthRecord]
+    mapping: KaptureFolder, local_type: str, job: tuple[str, DepthRecord]
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Return points in the camera frame (N, 3) and their keypoint ids (N,)."""
     image, depth = job
-    folder = spec.open()
     points, valid = lift_keypoints(
-        folder.keypoints(local_type).read(image),
-        read_depth(folder, depth),
-        folder.read().camera_of(image),
+        mapping.keypoints(local_type).read(image),
+        read_depth(mapping, depth),
+        mapping.read().camera_of(image),
         depth.camera,
         depth.image_from_depth,
     )

@@ -50,7 +50,7 @@ from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import DepthRecord, check_points, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
 
 # a point that loses observations is dropped if fewer than this remain
@@ -286,7 +286,7 @@ def _verify_depth(
     dropped = np.zeros(len(selection.kept), dtype=bool)
     num_checked = 0
     jobs = (job(image, rows) for image, rows in rows_of)
-    compare = partial(_compare, FolderSpec(folder), options)
+    compare = partial(_compare, folder, options)
     results = work.map(compare, jobs, "depth", len(rows_of))
     for (_, rows), (contradicted, checked) in zip(rows_of, results, strict=True):
         dropped[placed[rows[contradicted]]] = True
@@ -294,9 +294,7 @@ def _verify_depth(
     if lifted.any():
         scans = _scans(selection, with_depth, restrictions)
         rows = np.flatnonzero(lifted)
-        votes, judged = _votes_of_other_scans(
-            observed, rows, scans, FolderSpec(folder), options, work
-        )
+        votes, judged = _votes_of_other_scans(observed, rows, scans, folder, options, work)
         dropped[placed[rows[votes < 0]]] = True
         num_checked += int(judged.sum())
     selection.drop_observations("depth", dropped, num_checked)
@@ -341,7 +339,7 @@ def _votes_of_other_scans(
     observed: ObservedPoints,
     lifted: NDArray[np.int64],
     scans: Sequence[_Scan],
-    folder: FolderSpec,
+    folder: KaptureFolder,
     options: DepthVerificationOptions,
     work: Work,
 ) -> tuple[NDArray[np.int64], Mask]:
@@ -376,7 +374,7 @@ def _votes_of_other_scans(
 
 
 def _judge(
-    folder: FolderSpec,
+    folder: KaptureFolder,
     options: DepthVerificationOptions,
     job: tuple[list[_DepthView], Floats, Floats],
 ) -> tuple[Mask, Mask]:
@@ -385,7 +383,7 @@ def _judge(
     for record, cam_from_world in views:
         before, behind, checked = compare_with_depth(
             cam_from_world.apply(xyz),
-            read_depth(folder.open(), record),
+            read_depth(folder, record),
             record.camera,
             record.image_from_depth,
             options,
@@ -408,12 +406,12 @@ def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
 
 
 def _compare(
-    folder: FolderSpec, options: DepthVerificationOptions, job: _DepthJob
+    folder: KaptureFolder, options: DepthVerificationOptions, job: _DepthJob
 ) -> tuple[Mask, int]:
     depth, points, deviations = job
     contradicted, checked = contradicted_by_depth(
         points,
-        read_depth(folder.open(), depth),
+        read_depth(folder, depth),
         depth.camera,
         depth.image_from_depth,
         options,

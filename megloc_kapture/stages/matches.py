@@ -58,11 +58,9 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import (
     HERE,
     Batched,
-    FolderSpec,
     Work,
     batched,
     in_batches,
-    open_folder,
     resumed_label,
 )
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
@@ -162,9 +160,9 @@ def match_pairs(
     jobs: list[_Job] = []
     for image, group in groupby(todo, key=itemgetter(0)):
         jobs += [(image, some) for some in batched((b for _, b in group), _PAIRS_PER_ITEM)]
-    specs = FolderSpec(first), FolderSpec(second)
-    read = partial(_read, specs, local_type)
-    verify = partial(_verify, specs, local_type, verification)
+    folders = first, second
+    read = partial(_read, folders, local_type)
+    verify = partial(_verify, folders, local_type, verification)
     match: Any = partial(_match, matcher)
     steps: Batched[_Job, list[VerifiedMatches]] = Batched(
         read, match, matcher, "match_many", None, verify
@@ -218,8 +216,8 @@ def check_given_poses(
     Log a warning if some poses contradict the matches. If most do, raise DataError unless
     ``work.force``.
     """
-    specs = FolderSpec(mapping), FolderSpec(mapping)
-    read, finish = partial(_read, specs, local_type), partial(_evidence, specs, local_type)
+    read = partial(_read, (mapping, mapping), local_type)
+    finish = partial(_evidence, mapping, local_type)
     match: Any = partial(_match, matcher)
     steps: Batched[_Job, list[PairEvidence]] = Batched(
         read, match, matcher, "match_many", None, finish
@@ -258,14 +256,14 @@ def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
 
 
 def _evidence(
-    specs: tuple[FolderSpec, FolderSpec],
+    mapping: KaptureFolder,
     local_type: str,
     matched_job: tuple[_Job, Sequence[_PairMatches]],
 ) -> list[PairEvidence]:
     """Return the pairs of an image that a two-view model explains better than chance."""
     (image, others), matched = matched_job
-    data, options = specs[0].open().read(), TwoViewOptions()
-    a, *read = _read(specs, local_type, (image, others))
+    data, options = mapping.read(), TwoViewOptions()
+    a, *read = _read((mapping, mapping), local_type, (image, others))
     evidence = []
     for other, b, pair in zip(others, read, matched, strict=True):
         poses = data.cam_from_world(image), data.cam_from_world(other)
@@ -284,16 +282,17 @@ def _evidence(
 
 
 _Job = tuple[str, Sequence[str]]  # an image of the first folder, and some of the second
+_Folders = tuple[KaptureFolder, KaptureFolder]
 
 
 def _one_way(pair: ImagePair) -> tuple[str, str]:
     return min(pair.query, pair.map), max(pair.query, pair.map)
 
 
-def _read(specs: tuple[FolderSpec, FolderSpec], local_type: str, job: _Job) -> list[Features]:
+def _read(folders: _Folders, local_type: str, job: _Job) -> list[Features]:
     image, others = job
-    others_read = [cached_features(specs[1], local_type, other) for other in others]
-    return [cached_features(specs[0], local_type, image), *others_read]
+    others_read = [cached_features(folders[1], local_type, other) for other in others]
+    return [cached_features(folders[0], local_type, image), *others_read]
 
 
 def _match(
@@ -306,13 +305,13 @@ def _match(
 
 
 def _verify(
-    specs: tuple[FolderSpec, FolderSpec],
+    folders: _Folders,
     local_type: str,
     verification: Verification,
     matched_job: tuple[_Job, Sequence[_PairMatches]],
 ) -> list[VerifiedMatches]:
     (image, others), matched = matched_job
-    first, second = (spec.open().read() for spec in specs)
+    first, second = (folder.read() for folder in folders)
 
     def relative(other: str) -> RigidTransform | None:
         a_from_world, b_from_world = first.cam_from_world(image), second.cam_from_world(other)
@@ -320,7 +319,7 @@ def _verify(
             return None
         return b_from_world @ a_from_world.inverse()
 
-    a, *read = _read(specs, local_type, (image, others))
+    a, *read = _read(folders, local_type, (image, others))
     return [
         verified(a, b, pair, verification_of(verification, partial(relative, other)))
         for other, b, pair in zip(others, read, matched, strict=True)
@@ -386,21 +385,14 @@ def verification_of(
     return verify
 
 
-def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
-    return _features(spec.key, local_type, image)
-
-
 @lru_cache(maxsize=8)
-def _readers(
-    key: tuple[Any, ...], local_type: str
-) -> tuple[KaptureFolder, FeatureReader, FeatureReader]:
-    folder = open_folder(*key)
-    return folder, folder.keypoints(local_type), folder.descriptors(local_type)
+def _readers(folder: KaptureFolder, local_type: str) -> tuple[FeatureReader, FeatureReader]:
+    return folder.keypoints(local_type), folder.descriptors(local_type)
 
 
 @lru_cache(maxsize=CACHED_IMAGES)
-def _features(key: tuple[Any, ...], local_type: str, image: str) -> Features:
-    folder, keypoints, descriptors = _readers(key, local_type)
+def cached_features(folder: KaptureFolder, local_type: str, image: str) -> Features:
+    keypoints, descriptors = _readers(folder, local_type)
     check_lengths(keypoints, descriptors, image)
     camera = folder.read().camera_of(image)
     return Features.of(camera, keypoints.read(image), descriptors.read(image))

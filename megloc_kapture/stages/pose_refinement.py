@@ -56,7 +56,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
+from megloc_kapture.stages.work import HERE, Work, ordered_map
 from megloc_kapture.values import Camera, LocalizationResult, Options, Pose, RigidTransform
 
 # map images held out in parallel; the test stops early, so a larger number wastes more work
@@ -103,14 +103,13 @@ class MapRefiners:
                 "colmap --unit m` declares that a COLMAP model is in metres"
             )
         self.refiners = tuple(options.make_refiners(placement))
-        self.map = FolderSpec(mapping)
-        self._mapping, self._restrictions, self._options = mapping, restrictions, options
+        self.map, self._restrictions, self._options = mapping, restrictions, options
         self._verdicts: dict[str, list[Consistency | None]] = {}
         self._lock = threading.Lock()
 
     @cached_property
     def _by_frame(self) -> dict[str, ReferenceImages]:
-        poses = self._mapping.read().poses()
+        poses = self.map.read().poses()
         images = sorted(poses)
         return {
             self._restrictions.frame(images[members[0]]): ReferenceImages(
@@ -171,9 +170,9 @@ class MapRefiners:
 
 
 def _hold_out(
-    mapping: FolderSpec, refiner: HoldsOut, images: ReferenceImages, image: str
+    mapping: KaptureFolder, refiner: HoldsOut, images: ReferenceImages, image: str
 ) -> Displacement | None:
-    return refiner.hold_out(image, images, KaptureScene(mapping.open()))
+    return refiner.hold_out(image, images, KaptureScene(mapping))
 
 
 def _consistency_row(frame: str, method: str, consistency: Consistency) -> ConsistencyRow:
@@ -255,7 +254,7 @@ def refine_poses(
     poses = {name: result for name, result in results.items() if isinstance(result, Pose)}
     refiners.test(poses.values(), work=work)
     jobs = [(image, pose, *refiners.uses(pose)) for image, pose in poses.items()]
-    refine = partial(_refine, refiners.map, FolderSpec(query), refiners.refiners)
+    refine = partial(_refine, refiners.map, query, refiners.refiners)
     refined = list(work.map(refine, jobs, "refining", plugins=refiners.refiners))
     results |= {pose.name: pose for pose in refined}
     trajectories = {data.record_of(pose.name): pose.cam_from_world for pose in refined}
@@ -300,13 +299,13 @@ def _read_results(localized: KaptureFolder) -> dict[str, LocalizationResult]:
 
 
 def _refine(
-    mapping: FolderSpec,
-    query: FolderSpec,
+    mapping: KaptureFolder,
+    query: KaptureFolder,
     refiners: Sequence[PoseRefiner],
     job: tuple[str, Pose, Sequence[str], Sequence[str]],
 ) -> Pose:
     image, pose, references, distrusted = job
-    scene, camera = KaptureScene(mapping.open(), query.open()), query.open().read().camera_of(image)
+    scene, camera = KaptureScene(mapping, query), query.read().camera_of(image)
     return apply_refiners(image, camera, pose, references, distrusted, refiners, scene)
 
 

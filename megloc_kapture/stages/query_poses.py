@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -58,7 +58,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import MIN_CONFIDENCE, Failure, Fallback, Options, Pose, RigidTransform
 
 _FIRST_TURN = 8  # candidates that are matched first; each further turn doubles their number
@@ -233,52 +233,59 @@ def localize_query(
 _Job = tuple[Unit, Sequence[Sequence[str]], Mapping[str, str]]
 
 
-@dataclass(frozen=True)
-class _StoredQueries:
-    """Localizes a query, or the cameras of a rig, from stored matches; picklable."""
-
-    map: FolderSpec
-    query: FolderSpec
-    matches: FolderSpec
-    indices: dict[str, Path]  # by keypoints type
-    options: LocalizationOptions
-    ranker: PoseRanker
-
-    def __call__(self, job: _Job) -> list[Pose | Failure]:
-        unit, candidate_lists, frame_of = job
-        started = time.perf_counter()
-        mapping, query = self.map.open(), self.query.open()
-        centers = {
-            image: pose.center()
-            for image in interleave(candidate_lists)
-            if (pose := mapping.read().cam_from_world(image)) is not None
-        }
-        sources = [
-            StoredSource(self._read(*camera, images), [name for name in images if name in centers])
-            for camera, images in zip(unit, candidate_lists, strict=True)
-        ]
-        reading_s = (time.perf_counter() - started) / len(sources)
-        results = localize_query(
-            sources,
-            self.options,
-            frame_of=frame_of.__getitem__,
-            centers=centers,
-            ranker=self.ranker,
-            scene=KaptureScene(mapping, query),
+def _localize_stored(
+    mapping: KaptureFolder,
+    query: KaptureFolder,
+    matches: KaptureFolder,
+    indices: Mapping[str, Path],
+    options: LocalizationOptions,
+    ranker: PoseRanker,
+    job: _Job,
+) -> list[Pose | Failure]:
+    """Localize a query, or the cameras of a rig; ``indices`` are folders by keypoints type."""
+    unit, candidate_lists, frame_of = job
+    started = time.perf_counter()
+    centers = {
+        image: pose.center()
+        for image in interleave(candidate_lists)
+        if (pose := mapping.read().cam_from_world(image)) is not None
+    }
+    sources = [
+        StoredSource(
+            _read(query, matches, indices, *camera, images),
+            [name for name in images if name in centers],
         )
-        return [_for_writing(result, reading_s) for result in results]
+        for camera, images in zip(unit, candidate_lists, strict=True)
+    ]
+    reading_s = (time.perf_counter() - started) / len(sources)
+    results = localize_query(
+        sources,
+        options,
+        frame_of=frame_of.__getitem__,
+        centers=centers,
+        ranker=ranker,
+        scene=KaptureScene(mapping, query),
+    )
+    return [_for_writing(result, reading_s) for result in results]
 
-    def _read(self, image: str, cam_from_rig: RigidTransform, images: Sequence[str]) -> QueryView:
-        query, matches = self.query.open(), self.matches.open()
-        typed = []
-        for local_type, folder in self.indices.items():
-            reader = matches.matches(local_type)
-            pairs = [
-                (name, *reader.read(image, name)) for name in images if (image, name) in reader
-            ]
-            keypoints_px = query.keypoints(local_type).read(image)
-            typed.append(TypedMatches(_opened(folder), keypoints_px, pairs))
-        return QueryView(image, query.read().camera_of(image), tuple(typed), cam_from_rig)
+
+def _read(
+    query: KaptureFolder,
+    matches: KaptureFolder,
+    indices: Mapping[str, Path],
+    image: str,
+    cam_from_rig: RigidTransform,
+    candidates: Sequence[str],
+) -> QueryView:
+    typed = []
+    for local_type, folder in indices.items():
+        reader = matches.matches(local_type)
+        pairs = [
+            (name, *reader.read(image, name)) for name in candidates if (image, name) in reader
+        ]
+        keypoints_px = query.keypoints(local_type).read(image)
+        typed.append(TypedMatches(_opened(folder), keypoints_px, pairs))
+    return QueryView(image, query.read().camera_of(image), tuple(typed), cam_from_rig)
 
 
 def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
@@ -319,10 +326,9 @@ def localize_from_matches(
         images_of = [candidates.get(image, ()) for image, _ in unit]
         frames = {candidate: restrictions.frame(candidate) for candidate in chain(*images_of)}
         jobs.append((unit, images_of, frames))
-    specs = FolderSpec(map_folder), FolderSpec(query), FolderSpec(matches)
     with shared_index(measured, scratch) as indices:
-        localizer = _StoredQueries(*specs, indices, options, ranker)
-        for results in work.map(localizer, jobs, "localizing", plugins=(ranker,)):
+        localize = partial(_localize_stored, map_folder, query, matches, indices, options, ranker)
+        for results in work.map(localize, jobs, "localizing", plugins=(ranker,)):
             yield from results
 
 

@@ -41,7 +41,7 @@ from megloc_kapture.mvs.views import (
 from megloc_kapture.plugins import StereoView
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.scene import depth_of
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import RigidTransform
 
 FOLDER = "mvs"  # folder of depth maps below records_data, and of side files below sensors
@@ -170,7 +170,7 @@ def fuse_depth(
         (image, [other for other in others if other < image and other in images])
         for image, others in images.items()
     ]
-    parts = work.map(partial(_points, FolderSpec(densified), agreement), jobs, "cloud")
+    parts = work.map(partial(_points, densified, agreement), jobs, "cloud")
     nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     columns = zip(nothing, *parts, strict=True)
     xyz, colours, normals, sigma_m = (np.concatenate(column) for column in columns)
@@ -180,10 +180,10 @@ def fuse_depth(
 
 
 def _points(
-    spec: FolderSpec, agreement: Agreement, job: tuple[str, Sequence[str]]
+    folder: KaptureFolder, agreement: Agreement, job: tuple[str, Sequence[str]]
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return world points (N, 3), colours (N, 3), unit normals (N, 3) and deviations (N,)."""
-    (image, earlier), folder = job, spec.open()
+    image, earlier = job
     view, depth = _view_with_depth(folder, image)
     others = [_view_with_depth(folder, other) for other in earlier]
     new = (depth > 0) & (agreeing_views(view, depth, others, agreement) == 0)

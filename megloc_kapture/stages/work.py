@@ -14,14 +14,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import chain, groupby, islice
-from pathlib import Path
 from typing import Any, Generic, TypeVar
-from uuid import uuid4
 
 from megloc_kapture.errors import MeglocError, PluginError
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import AUTO, Placement
 
 Item = TypeVar("Item")
@@ -279,18 +275,3 @@ def _alike(
 
 
 HERE = Work()
-
-
-class FolderSpec:
-    """A kapture folder that is cheap to pickle and opened once per process and run."""
-
-    def __init__(self, folder: KaptureFolder) -> None:
-        self.key = (folder.root, folder.features_dirs, uuid4().hex)
-
-    def open(self) -> KaptureFolder:
-        return open_folder(*self.key)
-
-
-@lru_cache(maxsize=8)
-def open_folder(root: Path, features_dirs: tuple[Path, ...], run_id: str) -> KaptureFolder:
-    return KaptureFolder(root, features_dirs=features_dirs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -40,7 +41,7 @@ from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.stage import PipelineStage, StageWork, wanted_stages
-from megloc_kapture.stages.work import FolderSpec, Work, in_batches, is_out_of_memory, ordered_map
+from megloc_kapture.stages.work import Work, in_batches, is_out_of_memory, ordered_map
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 from tests.worlds import folder_bytes
 
@@ -340,9 +341,9 @@ def test_at_most_a_window_of_items_is_submitted() -> None:
             assert taken <= count + 5
 
 
-def test_a_folder_is_opened_once_in_a_run(world: Any) -> None:
-    spec = FolderSpec(world.mapping())
-    assert spec.open() is spec.open()
-    # another run opens it again and reads new features
-    other = FolderSpec(world.mapping())
-    assert other.open() is not spec.open()
+def test_a_process_opens_a_folder_once(world: Any) -> None:
+    folder = world.mapping()
+    sent = pickle.dumps(folder)
+    assert pickle.loads(sent) is pickle.loads(sent)
+    # a new folder is opened again and reads new features
+    assert pickle.loads(pickle.dumps(world.mapping())) is not pickle.loads(sent)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import filecmp
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +33,8 @@ _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_featu
 class KaptureFolder:
     """Lazy, read-only access to a kapture folder and to feature folders in the orphan layout.
 
-    The kapture's own features take precedence.
+    The kapture's own features take precedence. A pickle contains only paths; a process that
+    unpickles a folder several times opens it once.
     """
 
     def __init__(self, root: Path | str, *, features_dirs: Sequence[Path | str] = ()) -> None:
@@ -42,6 +45,10 @@ class KaptureFolder:
         self._data: KaptureData | None = None
         self._points: NDArray[np.float64] | None = None
         self._observations: dict[str, Observations] | None = None
+        self._id = uuid4().hex
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, (self.root, self.features_dirs, self._id)
 
     def with_features(self, features_dirs: Sequence[Path | str]) -> KaptureFolder:
         """Return the same kapture folder with other feature folders."""
@@ -219,6 +226,11 @@ class KaptureFolder:
                 f"are {num_points} points and {limit[image]} keypoints of type {keypoints_type!r}",
                 path=path,
             )
+
+
+@lru_cache(maxsize=8)
+def _unpickled(root: Path, features_dirs: tuple[Path, ...], folder_id: str) -> KaptureFolder:
+    return KaptureFolder(root, features_dirs=features_dirs)
 
 
 def _same_content(first: Path, second: Path) -> bool:
