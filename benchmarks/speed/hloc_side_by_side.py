@@ -103,12 +103,12 @@ def ours(job: dict[str, Any]) -> dict[str, Any]:
     bound = KnownPoseOptions(max_error_px=4 / 2**0.5) if matcher else KnownPoseOptions()
     map_matches = step("match map", lambda: match(mapping, map_pairs, bound))
     output, options = folder / "map", TriangulationOptions()
-    step("triangulation", lambda: triangulate_map(mapping, map_matches, TYPE, output, options))
+    step("triangulation", lambda: triangulate_map(map_matches, [TYPE], output, options))
     query_matches = step("match queries", lambda: match(query, query_pairs, TwoViewOptions()))
 
     def localize() -> dict[str, Any]:
         results = localize_from_matches(
-            KaptureFolder(output), query, query_matches, query_pairs, [TYPE], KEEP_ALL
+            KaptureFolder(output), query_matches, query_pairs, [TYPE], KEEP_ALL
         )
         return {
             pose.name: pose.cam_from_world.matrix()[:3].tolist()

@@ -177,7 +177,6 @@ class Triangulate(Reading, StageCommand):
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             counts = triangulate_map(
                 mapping,
-                mapping,
                 local_types,
                 out,
                 self.options().triangulation,

@@ -40,8 +40,7 @@ from megloc_kapture.stages.work import HERE, Work
 
 def triangulate_map(
     mapping: KaptureFolder,
-    matches: KaptureFolder,
-    local_types: Sequence[str] | str,
+    local_types: Sequence[str],
     output: Path,
     options: TriangulationOptions,
     *,
@@ -54,28 +53,26 @@ def triangulate_map(
 
     Parameters
     ----------
-    matches : folder of the verified matches.
+    mapping : folder of the images with their keypoints and verified matches.
     local_types : keypoints types; duplicates are ignored.
     pairs : restrict the matches to these pairs.
     num_threads : threads of COLMAP.
     """
-    types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
+    types = tuple(dict.fromkeys(local_types))
     data = mapping.read()
     images = sorted(data.poses())
     require(images, "no mapping image has a pose (sensors/trajectories.txt)", path=mapping.root)
     require(len(images) > 1, "points need two or more images with poses", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
-    of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
+    of_type = {name: matched_pairs(mapping.matches(name), images, asked) for name in types}
     for name in types:
         mapping.keypoints(name)
     xyz, errors_px = np.zeros((0, 3)), np.zeros(0)
     observations = {}
     by_type: dict[str, float] = {}
     for name, matched in of_type.items():
-        reader, scratch = matches.matches(name), output.absolute()
-        triangulated = _triangulated(
-            mapping, reader, images, matched, options, num_threads, scratch
-        )
+        scratch = output.absolute()
+        triangulated = _triangulated(mapping, name, images, matched, options, num_threads, scratch)
         observations[name] = Observations(
             keypoints_type=name,
             image_names=tuple(images),
@@ -132,23 +129,20 @@ def matched_pairs(
 
 def _triangulated(
     mapping: KaptureFolder,
-    reader: MatchesReader,
+    local_type: str,
     names: Sequence[str],
     pairs: NDArray[np.int64],
     options: TriangulationOptions,
     num_threads: int,
     scratch: Path,
 ) -> TriangulatedPoints:
-    data, poses, keypoints = (
-        mapping.read(),
-        mapping.read().poses(),
-        mapping.keypoints(reader.type_name),
-    )
+    data, keypoints = mapping.read(), mapping.keypoints(local_type)
+    poses = data.poses()
     images = [
         MapImage(image, data.camera_of(image), poses[image], keypoints.read(image)[:, :2])
         for image in names
     ]
-    verified = matches_of(reader, names, pairs)
+    verified = matches_of(mapping.matches(local_type), names, pairs)
     return triangulate(images, verified, options, num_threads=num_threads, scratch=scratch)
 
 
@@ -245,6 +239,4 @@ class MakePoints(PipelineStage):
         if not options.triangulates():
             return lift_map(mapping, options.local_types(), out, work=work)
         types, threads = options.point_types(), work.num_threads
-        return triangulate_map(
-            mapping, mapping, types, out, options.triangulation, num_threads=threads
-        )
+        return triangulate_map(mapping, types, out, options.triangulation, num_threads=threads)

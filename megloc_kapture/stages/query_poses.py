@@ -236,7 +236,6 @@ _Job = tuple[Unit, Sequence[Sequence[str]], Mapping[str, str]]
 def _localize_stored(
     mapping: KaptureFolder,
     query: KaptureFolder,
-    matches: KaptureFolder,
     indices: Mapping[str, Path],
     options: LocalizationOptions,
     ranker: PoseRanker,
@@ -252,7 +251,7 @@ def _localize_stored(
     }
     sources = [
         StoredSource(
-            _read(query, matches, indices, *camera, images),
+            _read(query, indices, *camera, images),
             [name for name in images if name in centers],
         )
         for camera, images in zip(unit, candidate_lists, strict=True)
@@ -271,7 +270,6 @@ def _localize_stored(
 
 def _read(
     query: KaptureFolder,
-    matches: KaptureFolder,
     indices: Mapping[str, Path],
     image: str,
     cam_from_rig: RigidTransform,
@@ -279,7 +277,7 @@ def _read(
 ) -> QueryView:
     typed = []
     for local_type, folder in indices.items():
-        reader = matches.matches(local_type)
+        reader = query.matches(local_type)
         pairs = [
             (name, *reader.read(image, name)) for name in candidates if (image, name) in reader
         ]
@@ -302,7 +300,6 @@ _opened = lru_cache(maxsize=8)(open_index)
 def localize_from_matches(
     map_folder: KaptureFolder,
     query: KaptureFolder,
-    matches: KaptureFolder,
     pairs: Sequence[ImagePair],
     local_types: Sequence[str],
     options: LocalizationOptions,
@@ -313,8 +310,9 @@ def localize_from_matches(
 ) -> Iterator[Pose | Failure]:
     """Localize every query from stored matches of ``local_types``; yield results sorted by name.
 
-    Cameras of a rig that are localized jointly stay together. A map may have the base type instead
-    of a guided pyramid type. ``scratch`` is a folder for a temporary map index.
+    ``query`` has the keypoints and the matches. Cameras of a rig that are localized jointly stay
+    together. A map may have the base type instead of a guided pyramid type. ``scratch`` is a folder
+    for a temporary map index.
     """
     ranker = options.make_ranker(work.placement)
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
@@ -327,7 +325,7 @@ def localize_from_matches(
         frames = {candidate: restrictions.frame(candidate) for candidate in chain(*images_of)}
         jobs.append((unit, images_of, frames))
     with shared_index(measured, scratch) as indices:
-        localize = partial(_localize_stored, map_folder, query, matches, indices, options, ranker)
+        localize = partial(_localize_stored, map_folder, query, indices, options, ranker)
         for results in work.map(localize, jobs, "localizing", plugins=(ranker,)):
             yield from results
 
@@ -371,7 +369,6 @@ class LocalizeQueries(PipelineStage):
         options, tables = self.options.localization, work.path(SIDE_TABLES)
         results = localize_from_matches(
             work.folder(MAP),
-            query,
             query,
             pairs,
             self.options.query_types(),

@@ -117,13 +117,13 @@ def test_our_stages_run_on_pairs_and_matches_of_kapture_localization(
     mapping = KaptureFolder(fountain / "mapping", features_dirs=places)
     assert len(mapping.matches(LOCAL).pairs) == 21  # all pairs of 7 images
     our_map, result = tmp_path / "map", tmp_path / "localized"
-    counts = triangulate_map(mapping, mapping, LOCAL, our_map, TriangulationOptions())
+    counts = triangulate_map(mapping, [LOCAL], our_map, TriangulationOptions())
     assert counts["points"] > 1000
     options = LocalizationOptions()
     pairs = read_pairs(theirs.query_pairs)
     places = [theirs.workspace, theirs.query_matches]
     query = KaptureFolder(fountain / "query", features_dirs=places)
-    actual = localize_from_matches(KaptureFolder(our_map), query, query, pairs, [LOCAL], options)
+    actual = localize_from_matches(KaptureFolder(our_map), query, pairs, [LOCAL], options)
     write_localized(result, query, actual)
     assert_all_localized(result, fountain / "query_gt")
 

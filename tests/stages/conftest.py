@@ -91,13 +91,14 @@ class World:
         work = options.pop("work", HERE)
         chosen = LocalizationOptions(**options)
         results = localize_from_matches(
-            self.map(), self.query(), self.with_matches("query"), pairs or self.query_pairs(),
+            self.map(), self.with_matches("query"), pairs or self.query_pairs(),
             ["rootsift"], chosen, work=work,
         )  # fmt: skip
         return list(results)
 
     def with_matches(self, kind: str) -> KaptureFolder:
-        return KaptureFolder(self.root / "mapping", features_dirs=[self.root / "matches" / kind])
+        places = [self.features_dir, self.root / "matches" / kind]
+        return KaptureFolder(self.root / kind, features_dirs=places)
 
 
 @pytest.fixture(scope="session")
@@ -126,7 +127,7 @@ def world(images_only: World) -> World:
             output = scene.root / "matches" / name
             match_pairs(first, scene.mapping(), some, "rootsift", NearestNeighbours(), how, output)
         triangulate_map(
-            scene.mapping(), scene.with_matches("mapping"), "rootsift", scene.root / "map",
+            scene.with_matches("mapping"), ["rootsift"], scene.root / "map",
             TriangulationOptions(),
         )  # fmt: skip
     return scene

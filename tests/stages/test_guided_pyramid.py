@@ -180,7 +180,7 @@ def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
     pairs = [ImagePair(image, other, 1.0) for image in truth for other in MAP_IMAGES[:2]]
     types, options = ["upright-pyramid"], LocalizationOptions()
     with single_threaded():
-        results = list(localize_from_matches(map_folder, query, query, pairs, types, options))
+        results = list(localize_from_matches(map_folder, query, pairs, types, options))
     near = [
         isinstance(found, Pose) and movement(truth[found.name], found.cam_from_world)[0] < 0.2
         for found in results
@@ -193,8 +193,8 @@ def test_rotated_queries_gain_matches_and_are_localized(scene: Scene, tmp_path: 
     with single_threaded():
         how, made = TriangulationOptions(), tmp_path / "map"
         with pytest.raises(DataError, match="no point could be triangulated"):
-            triangulate_map(scene.mapping(), scene.mapping(), "upright", tmp_path / "base", how)
-        counts = triangulate_map(mapping, mapping, "upright-pyramid", made, how)
+            triangulate_map(scene.mapping(), ["upright"], tmp_path / "base", how)
+        counts = triangulate_map(mapping, ["upright-pyramid"], made, how)
         off = scene.retry("turned", tmp_path / "off", options=GuidedPyramidOptions())
         more = scene.retry("turned", tmp_path / "max", options=MAX)
     assert counts["observations"] > 100 and counts["mean_reprojection_error_px"] < 1.0

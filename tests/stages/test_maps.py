@@ -117,7 +117,7 @@ def test_only_given_pairs_are_triangulated(world: Any, tmp_path: Path) -> None:
         ImagePair("left/0.png", "left/1.png", 1.0),
     ]
     counts = triangulate_map(
-        world.mapping(), world.with_matches("mapping"), "rootsift", tmp_path,
+        world.with_matches("mapping"), ["rootsift"], tmp_path,
         TriangulationOptions(two_view_tracks=True), pairs=pairs,
     )  # fmt: skip
     assert counts["pairs"] == 2 and counts["points"] > 100
@@ -137,13 +137,13 @@ def test_missing_poses_matches_and_depth_are_refused(
         lift_map(KaptureFolder(tmp_path / "no depth"), ["rootsift"], tmp_path / "map")
     matches, options = world.with_matches("mapping"), TriangulationOptions()
     with pytest.raises(DataError, match="no mapping image has a pose"):
-        triangulate_map(world.query(), matches, "rootsift", tmp_path / "map", options)
+        triangulate_map(world.query(), ["rootsift"], tmp_path / "map", options)
     first = dict(sorted(mapping.read().trajectories.items())[:1])
     write_sensors(tmp_path / "one", replace(mapping.read(), trajectories=first))
     with pytest.raises(DataError, match="one: points need two or more images with poses"):
-        triangulate_map(KaptureFolder(tmp_path / "one"), matches, "rootsift", tmp_path, options)
+        triangulate_map(KaptureFolder(tmp_path / "one"), ["rootsift"], tmp_path, options)
     with pytest.raises(DataError, match="no matches of type 'r2d2'"):
-        triangulate_map(world.mapping(), matches, ["rootsift", "r2d2"], tmp_path / "map", options)
+        triangulate_map(matches, ["rootsift", "r2d2"], tmp_path / "map", options)
     assert not (tmp_path / "map").exists()
 
 
@@ -160,11 +160,11 @@ def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_pat
             rows, scores = reader.read(a, b)
             even = (rows % 2 == 0).all(axis=1)
             writer.write(a, b, rows[even] // 2, scores[even].astype(np.float32))
-    mapping = KaptureFolder(world.root / "mapping", features_dirs=[world.features_dir, features])
-    matches = mapping.with_features([world.root / "matches" / "mapping", features])
+    mapping = world.with_matches("mapping")
+    mapping = mapping.with_features([*mapping.features_dirs, features])
     both, alone, options = tmp_path / "both", tmp_path / "alone", TriangulationOptions()
-    counts = triangulate_map(mapping, matches, ["rootsift", "half"], both, options, num_threads=3)
-    half_counts = triangulate_map(mapping, matches, "half", alone, options)
+    counts = triangulate_map(mapping, ["rootsift", "half"], both, options, num_threads=3)
+    half_counts = triangulate_map(mapping, ["half"], alone, options)
     found, first, second = KaptureFolder(both), world.map(), KaptureFolder(alone)
     found.validate(deep=True)
     points = np.concatenate([first.points3d(), second.points3d()])
