@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from megloc_kapture.io.files import link_images, link_records, remove, safe_join
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
+from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.depth import lift_with_covariances
 from megloc_kapture.mvs.views import (
     Agreement,
@@ -114,19 +115,6 @@ class StereoFit:
     error_px: float
 
 
-@dataclass(frozen=True)
-class _Job:
-    folder: KaptureFolder
-    scratch: Path
-    out: Path
-    image: str
-    sources: tuple[str, ...]
-    range_m: tuple[float, float]
-    fit: StereoFit
-    estimator: DepthEstimator
-    seen: Mapping[str, NDArray[np.int32]]
-
-
 def densify_map(
     source: KaptureFolder,
     output: Path,
@@ -147,30 +135,37 @@ def densify_map(
     data = source.read()
     _check(source, data)
     fit = fitted_to_poses(source, options.max_size_px)
-    jobs, rows = _plan(source, output, options, fit, estimator, restrictions)
-    reasons = work.map(_estimate, jobs, "depth", plugins=(estimator,))
-    failed = {job.image: reason for job, reason in zip(jobs, list(reasons), strict=True) if reason}
-    done = [job for job in jobs if job.image not in failed]
-    rows = [replace(row, reason=failed.get(row.image, row.reason)) for row in rows]
+    indices = [index_map(source, local_type) for local_type in source.observations()]
+    rows = _plan(source, indices, fit, restrictions)
+    scratch = output / f".{FOLDER}"
+    planned = [row for row in rows if not row.reason]
+    estimate = partial(_estimate, source, scratch, fit, estimator)
+    reasons = work.map(estimate, planned, "depth", plugins=(estimator,))
+    reason_of = {row.image: reason for row, reason in zip(planned, reasons, strict=True)}
+    rows = [replace(row, reason=reason_of.get(row.image, row.reason)) for row in rows]
+    lifts = indices if options.mode == "points" else ()
+    jobs = [
+        (row, {index.local_type: index.observed(row.image)[0] for index in lifts})
+        for row in rows
+        if not row.reason
+    ]
     lifted: dict[str, dict[str, LiftedPoints]] = {}
     fills = {}
-    for job, (fill, points_of_type) in zip(
-        done, work.map(_confirm, done, "agreement"), strict=True
-    ):
-        fills[job.image] = fill
+    results = work.map(partial(_confirm, source, scratch, output, fit), jobs, "agreement")
+    for (row, _), (fill, points_of_type) in zip(jobs, results, strict=True):
+        fills[row.image] = fill
         for local_type, points in points_of_type.items():
-            lifted.setdefault(local_type, {})[job.image] = points
-    if jobs:
-        remove(jobs[0].scratch)
+            lifted.setdefault(local_type, {})[row.image] = points
+    remove(scratch)
     rows = [replace(row, fill=fills.get(row.image, 0.0)) for row in rows]
-    write_sensors(output, with_depth_sensors(data, [job.image for job in done], fit.max_size_px))
+    write_sensors(output, with_depth_sensors(data, list(fills), fit.max_size_px))
     _link_images_and_masks(source, output)
     copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
     write_depth_rows(output / DEPTH_FILE, rows)
     return {
         "images": len(rows),
-        "images_with_depth": len(done),
+        "images_with_depth": len(fills),
         "share_with_depth": round(float(np.mean(list(fills.values()))), 4) if fills else 0.0,
         "points_lifted": num_lifted,
         "max_size_px": fit.max_size_px,
@@ -232,16 +227,14 @@ def fitted_to_poses(source: KaptureFolder, max_size_px: int) -> StereoFit:
 
 def _plan(
     source: KaptureFolder,
-    output: Path,
-    options: DensifyOptions,
+    indices: Sequence[MapIndex],
     fit: StereoFit,
-    estimator: DepthEstimator,
     restrictions: Restrictions,
-) -> tuple[list[_Job], list[DepthRow]]:
+) -> list[DepthRow]:
+    """Return a row per image, with sources and depth range, or the reason why it has no depth."""
     data, xyz = source.read(), source.points3d()[:, :3]
     poses = data.poses()
     images = list(poses)
-    indices = [index_map(source, local_type) for local_type in source.observations()]
     points_of = [
         np.unique(np.concatenate([_NO_POINTS, *(index.observed(image)[1] for index in indices)]))
         for image in images
@@ -258,8 +251,7 @@ def _plan(
     for row, key in enumerate(keys):
         members.setdefault(key, np.zeros(len(images), bool))[row] = True
     has_depth = depth_records(data)
-    scratch = output / f".{FOLDER}"
-    jobs, rows = [], []
+    rows = []
     for row, image in enumerate(images):
         blank = DepthRow(image, (), 0.0, 0.0, 0.0, "")
         if image in has_depth:
@@ -279,11 +271,8 @@ def _plan(
             reason = "too few visible points" if limits is None else "no image shares points"
             rows.append(replace(blank, reason=reason))
             continue
-        lifts = indices if options.mode == "points" else ()
-        seen = {index.local_type: index.observed(image)[0] for index in lifts}
-        jobs.append(_Job(source, scratch, output, image, sources, limits, fit, estimator, seen))
         rows.append(replace(blank, sources=sources, near_m=limits[0], far_m=limits[1]))
-    return jobs, rows
+    return rows
 
 
 def _session(restrictions: Restrictions, image: str) -> tuple[str, str, str]:
@@ -303,53 +292,64 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
     return stereo_view(pixels, data.camera_of(image), pose, mask, max_size_px)
 
 
-def _estimate(job: _Job) -> str:
+def _estimate(
+    folder: KaptureFolder, scratch: Path, fit: StereoFit, estimator: DepthEstimator, row: DepthRow
+) -> str:
     """Estimate an image's depth into the scratch folder; return the reason if it fails, else ""."""
-    folder, size = job.folder, job.fit.max_size_px
     try:
-        views = [_view(folder, image, size) for image in (job.image, *job.sources)]
-        estimate = job.estimator.estimate(views[0], views[1:], job.range_m)
+        views = [_view(folder, image, fit.max_size_px) for image in (row.image, *row.sources)]
+        estimate = estimator.estimate(views[0], views[1:], (row.near_m, row.far_m))
     except MeglocError as error:
         return str(error)
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
         return "out of memory; make mvs.max_size_px smaller"
-    write_array(_scratch(job, job.image, "depth"), estimate.depth_m)
-    write_array(_scratch(job, job.image, "sigma"), estimate.sigma_m)
-    write_array(_scratch(job, job.image, "normals"), estimate.normals)
+    write_array(_scratch_file(scratch, row.image, "depth"), estimate.depth_m)
+    write_array(_scratch_file(scratch, row.image, "sigma"), estimate.sigma_m)
+    write_array(_scratch_file(scratch, row.image, "normals"), estimate.normals)
     return ""
 
 
-def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
-    """Write the depth that sources confirm; return its share of the pixels, and lifted points."""
-    folder, size = job.folder, job.fit.max_size_px
-    view = _view(folder, job.image, size)
+def _confirm(
+    folder: KaptureFolder,
+    scratch: Path,
+    out: Path,
+    fit: StereoFit,
+    job: tuple[DepthRow, Mapping[str, NDArray[np.int32]]],
+) -> tuple[float, dict[str, LiftedPoints]]:
+    """Write the depth that sources confirm; return its share of the pixels, and lifted points.
+
+    A job has the row of an image, and its keypoints that observe a point, which are not lifted.
+    """
+    row, seen_of_type = job
+    image, size = row.image, fit.max_size_px
+    view = _view(folder, image, size)
     names = ("depth", "sigma", "normals")
-    estimate = DepthEstimate(*(np.load(_scratch(job, job.image, name)) for name in names))
-    sources = [_view(folder, other, size) for other in job.sources]
+    estimate = DepthEstimate(*(np.load(_scratch_file(scratch, image, name)) for name in names))
+    sources = [_view(folder, other, size) for other in row.sources]
     others = [
         (source, np.load(path))
-        for other, source in zip(job.sources, sources, strict=True)
-        if (path := _scratch(job, other, "depth")).is_file()
+        for other, source in zip(row.sources, sources, strict=True)
+        if (path := _scratch_file(scratch, other, "depth")).is_file()
     ]
-    agreement = job.fit.agreement
-    kept = confirmed(view, estimate, others, agreement)
-    kept = with_pose_errors(view, sources, kept, job.range_m, _DEVIATION * job.fit.error_px)
-    records = job.out / "sensors" / "records_data"
-    write_depth_map(safe_join(records, depth_path(job.image)), kept.depth_m)
-    write_array(side_file(job.out, job.image, "sigma"), kept.sigma_m)
+    kept = confirmed(view, estimate, others, fit.agreement)
+    limits = row.near_m, row.far_m
+    kept = with_pose_errors(view, sources, kept, limits, _DEVIATION * fit.error_px)
+    records = out / "sensors" / "records_data"
+    write_depth_map(safe_join(records, depth_path(image)), kept.depth_m)
+    write_array(side_file(out, image, "sigma"), kept.sigma_m)
     normals = np.rint(127 * kept.normals).astype(np.int8)
-    write_array(side_file(job.out, job.image, "normals"), normals)
+    write_array(side_file(out, image, "normals"), normals)
     lifted = {}
-    if job.seen:
-        views = agreeing_views(view, kept.depth_m, others, agreement)
+    if seen_of_type:
+        views = agreeing_views(view, kept.depth_m, others, fit.agreement)
         sure = np.where(views >= _ANCHOR_VIEWS, kept.depth_m, np.float32(0))
-        camera = folder.read().camera_of(job.image)
-        for local_type, seen in job.seen.items():
+        camera = folder.read().camera_of(image)
+        for local_type, seen in seen_of_type.items():
             reader = folder.keypoints(local_type)
-            if job.image in reader:
-                keypoints = np.asarray(reader.read(job.image))
+            if image in reader:
+                keypoints = np.asarray(reader.read(image))
                 unseen = np.setdiff1d(np.arange(len(keypoints)), seen)
                 lifted[local_type] = _lift(keypoints, unseen, camera, view, sure, kept.sigma_m)
     return float((kept.depth_m > 0).mean()), lifted
@@ -372,8 +372,8 @@ def _lift(
     return LiftedPoints(view.cam_from_world.inverse().apply(points[valid]), packed, ids[valid])
 
 
-def _scratch(job: _Job, image: str, kind: str) -> Path:
-    return safe_join(job.scratch, f"{image}.{kind}.npy")
+def _scratch_file(scratch: Path, image: str, kind: str) -> Path:
+    return safe_join(scratch, f"{image}.{kind}.npy")
 
 
 class Densify(PipelineStage):
