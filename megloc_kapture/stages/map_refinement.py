@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -292,9 +292,11 @@ def _verify_depth(
         dropped[placed[rows[contradicted]]] = True
         num_checked += checked
     if lifted.any():
-        scans = _scans(selection, with_depth, restrictions)
+        views, neighbours = _scans(selection, with_depth, restrictions)
         rows = np.flatnonzero(lifted)
-        votes, judged = _votes_of_other_scans(observed, rows, scans, folder, options, work)
+        votes, judged = _votes_of_other_scans(
+            observed, rows, views, neighbours, folder, options, work
+        )
         dropped[placed[rows[votes < 0]]] = True
         num_checked += int(judged.sum())
     selection.drop_observations("depth", dropped, num_checked)
@@ -303,17 +305,13 @@ def _verify_depth(
 _DepthView = tuple[DepthRecord, RigidTransform]
 
 
-@dataclass(frozen=True)
-class _Scan:
-    views: Mapping[int, _DepthView]
-    neighbours: frozenset[int]
-
-
 def _scans(
     selection: MapSelection, with_depth: Mapping[int, DepthRecord], restrictions: Restrictions
-) -> list[_Scan]:
+) -> tuple[list[dict[int, _DepthView]], list[set[int]]]:
+    """Return the depth views of each scan by image, and the nearest scans of each."""
     images = list(with_depth)
-    scans: list[_Scan] = []
+    views: list[dict[int, _DepthView]] = []
+    neighbours: list[set[int]] = []
     for members in restrictions.frames([selection.images[row] for row in images]):
         rows = [images[member] for member in members]
         cams = [selection.cams_from_world[row] for row in rows]
@@ -321,24 +319,23 @@ def _scans(
         pairs = cKDTree(centres).query_pairs(_SAME_CENTRE_M, output_type="ndarray")
         links = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(rows), len(rows)))
         count, scan_of = connected_components(links, directed=False)
-        views: list[dict[int, _DepthView]] = [{} for _ in range(count)]
+        first = len(views)
+        views += [{} for _ in range(count)]
         for scan, row, cam in zip(scan_of.tolist(), rows, cams, strict=True):
-            views[scan][row] = with_depth[row], cam
+            views[first + scan][row] = with_depth[row], cam
         centres = centres[np.unique(scan_of, return_index=True)[1]]
         # the nearest is the scan itself, which is removed below
-        nearest = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
-        neighbours = cKDTree(centres).query(centres, k=nearest)[1] + len(scans)
-        scans += [
-            _Scan(view, frozenset(others) - {len(scans) + number})
-            for number, (view, others) in enumerate(zip(views, neighbours.tolist(), strict=True))
-        ]
-    return scans
+        ranks = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
+        nearest = cKDTree(centres).query(centres, k=ranks)[1] + first
+        neighbours += [set(others) - {at} for at, others in enumerate(nearest.tolist(), first)]
+    return views, neighbours
 
 
 def _votes_of_other_scans(
     observed: ObservedPoints,
     lifted: NDArray[np.int64],
-    scans: Sequence[_Scan],
+    views: Sequence[Mapping[int, _DepthView]],
+    neighbours: Sequence[Collection[int]],
     folder: KaptureFolder,
     options: DepthVerificationOptions,
     work: Work,
@@ -348,22 +345,23 @@ def _votes_of_other_scans(
     A scan votes +1 if it has a surface at the point, -1 if it sees through the point.
     """
     scan_of = np.full(len(observed.cameras), -1)
-    for number, scan in enumerate(scans):
-        scan_of[list(scan.views)] = number
+    for number, of_scan in enumerate(views):
+        scan_of[list(of_scan)] = number
     own_scan = scan_of[observed.image_ids[lifted]]
     order = np.argsort(own_scan, kind="stable")
-    of_scan = np.split(order, np.searchsorted(own_scan[order], np.arange(1, len(scans))))
-    members: list[list[NDArray[np.int64]]] = [[] for _ in scans]
-    for rows, scan in zip(of_scan, scans, strict=True):
-        for other in scan.neighbours:
-            members[other].append(rows)
-    asked = [(scan, np.concatenate(of)) for scan, of in zip(scans, members, strict=True) if of]
+    rows_of_scan = np.split(order, np.searchsorted(own_scan[order], np.arange(1, len(views))))
+    judged_rows: list[list[NDArray[np.int64]]] = [[] for _ in views]
+    for rows, others in zip(rows_of_scan, neighbours, strict=True):
+        for other in others:
+            judged_rows[other].append(rows)
+    asked = [
+        (list(of_scan.values()), np.concatenate(parts))
+        for of_scan, parts in zip(views, judged_rows, strict=True)
+        if parts
+    ]
     points = observed.point_ids[lifted]
     sigmas = depth_noise(mean_depths(observed)[points], options.noise)
-    jobs = (
-        (list(scan.views.values()), observed.xyz[points[rows]], sigmas[rows])
-        for scan, rows in asked
-    )
+    jobs = ((of_scan, observed.xyz[points[rows]], sigmas[rows]) for of_scan, rows in asked)
     judge = partial(_judge, folder, options)
     votes, judged = np.zeros(len(lifted), np.int64), np.zeros(len(lifted), bool)
     results = work.map(judge, jobs, "depth of other scans", len(asked))
