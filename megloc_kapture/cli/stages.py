@@ -225,9 +225,7 @@ class ExtractGlobal(Reading, StageCommand):
                     asked = self.local_type or options.local_type
                     local_type = only_type(folders[0], "descriptors", asked)
                     type_name = vlad_type(local_type)
-                    counts = extract_vlad(
-                        folders[0], folders, local_type, out, options.of_vlad(), work=work
-                    )
+                    counts = extract_vlad(folders[0], folders, local_type, out, options, work=work)
                 else:
                     extractor = extractors[choice.name]
                     type_name = extractor.name

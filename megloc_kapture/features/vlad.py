@@ -59,6 +59,9 @@ class VladOptions(Options):
     )
     assignment: Literal["hard", "soft"] = "hard"
     seed: int = Field(default=0, ge=0)
+    local_type: str | None = Field(
+        default=None, description="type of local features to aggregate; none: the run's first type"
+    )
 
 
 @dataclass(frozen=True, eq=False)

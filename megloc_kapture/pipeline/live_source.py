@@ -521,9 +521,9 @@ class MapMatching:
 
     def _trained(self, kind: _GlobalType) -> tuple[Vocabulary, VladSettings]:
         assert kind.choice is not None
-        vlad = kind.choice.vlad_options()
-        local = self.types[self._position(vlad.local_type or self.types[0].name)]
-        options, images = vlad.of_vlad(), [i for i in self._map.images if i in local.first]
+        options = kind.choice.vlad_options()
+        local = self.types[self._position(options.local_type or self.types[0].name)]
+        images = [image for image in self._map.images if image in local.first]
         vocabulary = train_vlad(
             images, lambda image: len(local.descriptors(image)), local.descriptors, options
         )

@@ -164,15 +164,6 @@ def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
 VLAD = "vlad"
 
 
-class VladChoiceOptions(VladOptions):
-    local_type: str | None = Field(
-        default=None, description="type of local features to aggregate; none: the run's first type"
-    )
-
-    def of_vlad(self) -> VladOptions:
-        return VladOptions(**self.model_dump(exclude={"local_type"}))
-
-
 class GlobalFeaturesChoice(PluginChoice):
     """Global features by name (``vlad`` or a plugin), with options and fusion weight."""
 
@@ -183,11 +174,11 @@ class GlobalFeaturesChoice(PluginChoice):
     def is_vlad(self) -> bool:
         return self.name == VLAD
 
-    def vlad_options(self) -> VladChoiceOptions:
+    def vlad_options(self) -> VladOptions:
         try:
-            return VladChoiceOptions(**self.options)
+            return VladOptions(**self.options)
         except ValidationError as error:
-            fault = option_fault(error, VladChoiceOptions)
+            fault = option_fault(error, VladOptions)
             raise OptionError(f"global features {VLAD!r} reject their options: {fault}") from error
 
     def make(self, placement: Placement = AUTO) -> GlobalFeatureExtractor:
@@ -325,9 +316,7 @@ class ExtractGlobalFeatures(PipelineStage):
                 vlad = chosen.vlad_options()
                 name = vlad.local_type or self.options.main_type()
                 folders = [mapping, *queries]
-                type_counts = extract_vlad(
-                    mapping, folders, name, work.out, vlad.of_vlad(), work=work
-                )
+                type_counts = extract_vlad(mapping, folders, name, work.out, vlad, work=work)
             else:
                 extractor = chosen.make(work.placement)
                 type_counts = extract_global_features(
