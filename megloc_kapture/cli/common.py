@@ -101,6 +101,14 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(folders)
 
 
+def kapture_map(path: Path) -> KaptureFolder:
+    """Open the kapture folder of a map or workspace."""
+    # importing the workspace is slow
+    from megloc_kapture.pipeline.plan import map_of_workspace
+
+    return KaptureFolder(map_of_workspace(path))
+
+
 def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:
     """Return a map's kapture folder; a COLMAP model is imported into the user's cache."""
     # importing the stages is slow
@@ -203,29 +211,7 @@ class Working(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Linked:
-    """Flags of commands that read kapture folders."""
-
-    allow_links_below: Folders = ()
-    """No effect; accepted for older scripts. Links in kapture folders are always followed."""
-
-    @property
-    def features_dirs(self) -> tuple[Path, ...]:
-        return ()
-
-    def kapture(self, root: Path) -> KaptureFolder:
-        return KaptureFolder(root, features_dirs=self.features_dirs)
-
-    def kapture_map(self, root: Path) -> KaptureFolder:
-        """Open the kapture folder of a map or workspace."""
-        # importing the workspace is slow
-        from megloc_kapture.pipeline.plan import map_of_workspace
-
-        return self.kapture(map_of_workspace(root))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reading(Linked):
+class Reading:
     """Flags of commands that read features of kapture folders."""
 
     features_dir: Folders = ()
@@ -234,6 +220,13 @@ class Reading(Linked):
     @property
     def features_dirs(self) -> tuple[Path, ...]:
         return existing(self.features_dir)
+
+    def kapture(self, root: Path) -> KaptureFolder:
+        return KaptureFolder(root, features_dirs=self.features_dirs)
+
+    def kapture_map(self, root: Path) -> KaptureFolder:
+        """Open the kapture folder of a map or workspace."""
+        return self.kapture(kapture_map(root).root)
 
     def open_map(
         self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice

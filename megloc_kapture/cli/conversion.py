@@ -12,7 +12,6 @@ from megloc_kapture.cli.common import (
     Common,
     Console,
     Force,
-    Linked,
     Output,
     Overwrite,
     Texts,
@@ -23,6 +22,7 @@ from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -189,7 +189,7 @@ class Export(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Linked, Common):
+class View(Common):
     """Write a page that shows a map and localized queries in 3D; it works offline."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
@@ -210,7 +210,7 @@ class View(Linked, Common):
         # slow import
         from megloc_kapture.evaluation.view import write_view
 
-        folder = self.kapture(opened_map(self.map, console))
+        folder = KaptureFolder(opened_map(self.map, console))
         left_out = write_view(self.output, folder, self.result, self.gt, force=self.force)
         if left_out:
             console.say(left_out)

@@ -13,12 +13,12 @@ from megloc_kapture.cli.common import (
     Console,
     Force,
     Input,
-    Linked,
     Output,
     Reading,
     Texts,
     Working,
     cameras_of_text,
+    kapture_map,
 )
 from megloc_kapture.cli.stages import StageCommand
 from megloc_kapture.errors import OptionError
@@ -162,7 +162,7 @@ class Densify(Reading, StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinePoses(Linked, StageCommand):
+class RefinePoses(StageCommand):
     """Refine the poses of localized queries; a refined pose that is no better is rejected, with
     the reason."""
 
@@ -189,9 +189,9 @@ class RefinePoses(Linked, StageCommand):
             raise OptionError(f"no pose refiner is chosen; give --by: {names}")
         with self.staged(self.output, LOCALIZED, force=self.force) as (out, work):
             counts = refine_poses(
-                self.kapture_map(self.input),
-                self.kapture(self.query),
-                self.kapture(self.poses),
+                kapture_map(self.input),
+                KaptureFolder(self.query),
+                KaptureFolder(self.poses),
                 out,
                 options,
                 restrictions=restrictions_beside(self.query),

@@ -23,13 +23,13 @@ from megloc_kapture.cli.common import (
     Force,
     Input,
     Inputs,
-    Linked,
     Output,
     Overwrite,
     Reading,
     Texts,
     Working,
     existing,
+    kapture_map,
 )
 from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
@@ -89,7 +89,7 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractLocal(Linked, StageCommand):
+class ExtractLocal(StageCommand):
     """Extract local features of all images of kapture folders."""
 
     input: Inputs = ()
@@ -102,7 +102,7 @@ class ExtractLocal(Linked, StageCommand):
 
     def run(self, console: Console) -> None:
         check_option(self.input, "no kapture folder given; use -i")
-        folders = [self.kapture_map(path) for path in self.input]
+        folders = [kapture_map(path) for path in self.input]
         options = self.options(self.named("local_features", self.features))
         extractors = options.make_extractors()
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
@@ -407,7 +407,7 @@ def stage_command(name: str) -> type[Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preprocess(Linked, Computing, Working):
+class Preprocess(Computing, Working):
     """Resize, undistort and mask the images of a kapture folder; cameras are adapted."""
 
     input: Input
@@ -440,8 +440,8 @@ class Preprocess(Linked, Computing, Working):
 
     def run(self, console: Console) -> None:
         options = self.options()
-        source = self.kapture_map(self.input)
-        sequences = [self.kapture(path) for path in existing(self.sequence)]
+        source = kapture_map(self.input)
+        sequences = [KaptureFolder(path) for path in existing(self.sequence)]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             counts = preprocess_images(source, out, options, sequences=sequences, work=work)
         console.say(f"{counts['images']} images, {counts['images_changed']} of them changed")

@@ -15,15 +15,16 @@ from megloc_kapture.cli.common import (
     Folders,
     Input,
     Inputs,
-    Linked,
     Output,
     Overwrite,
     Texts,
     Working,
     camera_of_text,
+    kapture_map,
 )
 from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, require
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.work import Work
@@ -31,7 +32,7 @@ from megloc_kapture.values import RigidTransform
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Linked, Common):
+class Train(Common):
     """Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on
     photographs. Repeat the command to resume."""
 
@@ -67,9 +68,9 @@ class Train(Linked, Common):
         last = train(
             options,
             self.output,
-            kaptures=[self.kapture_map(path) for path in self.input],
+            kaptures=[kapture_map(path) for path in self.input],
             photographs=self.photographs,
-            held_out=[self.kapture(path) for path in self.held_out],
+            held_out=[KaptureFolder(path) for path in self.held_out],
             force=self.force,
             threads=self.threads,
             work=Work(track=console.track),
@@ -87,7 +88,7 @@ _MIN_SHOWN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainField(Linked, Common):
+class TrainField(Common):
     """Train a neural field (NeRF-W) on the images of a map, to render views and refine poses.
     Repeat the command to resume."""
 
@@ -141,7 +142,7 @@ class TrainField(Linked, Common):
                 + (f", held-out images {held_out} dB" if held_out else "")
             )
 
-        mapping, state = self.kapture_map(self.input), self.output / STATE_FILE
+        mapping, state = kapture_map(self.input), self.output / STATE_FILE
         is_new = claim_folder(self.output, kind=FIELD, force=self.force)
         try:
             if self.force:
@@ -157,7 +158,7 @@ class TrainField(Linked, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Linked, Working):
+class Render(Working):
     """Render views of a neural field: at a pose, along a result, or between map cameras."""
 
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
@@ -196,7 +197,7 @@ class Render(Linked, Working):
             return
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
-        data = self.kapture_map(many).read()
+        data = kapture_map(many).read()
         require(data.poses(), "no image here has a pose", path=many)
         with self.staged(self.output, RENDERED, force=self.force) as (out, work):
             count = render_along(
