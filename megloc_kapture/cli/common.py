@@ -35,6 +35,7 @@ from megloc_kapture.values import Camera
 if TYPE_CHECKING:
     from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
     from megloc_kapture.pipeline.plan import Workspace
+    from megloc_kapture.stages.options import PipelineOptions
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
@@ -270,6 +271,13 @@ class Choosing(Computing):
 
     def assignments(self) -> tuple[str, ...]:
         return (*self.set, *self.placed())
+
+    def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
+        """Return the preset's options with changes, those of ``--set`` last."""
+        from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+
+        preset = self.preset or DEFAULT_PRESET
+        return options_of_preset(preset, changes=[changes or {}], assignments=self.assignments())
 
     def placement(self) -> Placement:
         from megloc_kapture.pipeline.presets import assigned  # slow import

@@ -36,11 +36,9 @@ from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import LOCALIZED
 
 _log = logging.getLogger(__name__)
@@ -92,7 +90,7 @@ class Localize(Reading, Deciding, Common):
         path = opened_map(self.input, console, force=self.force)
         kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
         _check_consistent(kapture_map, self.input, force=self.force)
-        options = _options_of(self)
+        options = self.options()
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
         # fail before the first query and before anything is written
         localizer = Localizer(kapture_map, options=options)
@@ -191,7 +189,7 @@ class Serve(Reading, Deciding, Common):
             raise OptionError(
                 f"--host {self.host}: reachable from other machines; give --token-file"
             )
-        options = _options_of(self)
+        options = self.options()
         with bind(self.host, self.port) as bound:
             path = opened_map(self.map, console, force=self.force)
             kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
@@ -218,10 +216,6 @@ def _read_token(path: Path) -> str:
         path=path,
     )
     return token
-
-
-def _options_of(command: Deciding) -> PipelineOptions:
-    return options_of_preset(command.preset or DEFAULT_PRESET, assignments=command.assignments())
 
 
 def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:

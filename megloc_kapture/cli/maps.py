@@ -20,7 +20,6 @@ from megloc_kapture.cli.common import (
     cameras_of_text,
     kapture_map,
 )
-from megloc_kapture.cli.stages import StageCommand
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
@@ -82,7 +81,7 @@ class MapPhotographs(Choosing, Working):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineMap(Reading, StageCommand):
+class RefineMap(Reading, Choosing, Working):
     """Remove points and observations that a map's depth maps contradict.
 
     --set refinement.uncertainty.max_robust_sigmas=2.5 also rejects uncertain points; if it is
@@ -125,7 +124,7 @@ def report_lines(root: Path) -> list[str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Densify(Reading, StageCommand):
+class Densify(Reading, Choosing, Working):
     """Estimate depth of map images without depth, by multi-view stereo.
 
     The depth maps are kapture depth records; verification, perceptual ranking and refinement by
@@ -162,7 +161,7 @@ class Densify(Reading, StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinePoses(StageCommand):
+class RefinePoses(Choosing, Working):
     """Refine the poses of localized queries; a refined pose that is no better is rejected, with
     the reason."""
 

@@ -58,19 +58,10 @@ from megloc_kapture.stages.stage import count_text
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
 
 
-@dataclass(frozen=True, kw_only=True)
-class StageCommand(Choosing, Working):
-    def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
-        return options_of_preset(
-            self.preset or DEFAULT_PRESET,
-            changes=[changes or {}, assigned(self.placed())],
-            assignments=self.set,
-        )
-
-    def named(self, key: str, names: Sequence[str]) -> dict[str, object]:
-        """Return changes that select plugins by name, with the preset's settings for them."""
-        preset = getattr(options_of_preset(self.preset or DEFAULT_PRESET), key)
-        return {key: chosen_by_name(preset, names)} if names else {}
+def _named(preset: str | None, key: str, names: Sequence[str]) -> dict[str, object]:
+    """Return changes that select plugins by name, with the preset's settings for them."""
+    known = getattr(options_of_preset(preset or DEFAULT_PRESET), key)
+    return {key: chosen_by_name(known, names)} if names else {}
 
 
 def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
@@ -89,7 +80,7 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractLocal(StageCommand):
+class ExtractLocal(Choosing, Working):
     """Extract local features of all images of kapture folders."""
 
     input: Inputs = ()
@@ -103,7 +94,7 @@ class ExtractLocal(StageCommand):
     def run(self, console: Console) -> None:
         check_option(self.input, "no kapture folder given; use -i")
         folders = [kapture_map(path) for path in self.input]
-        options = self.options(self.named("local_features", self.features))
+        options = self.options(_named(self.preset, "local_features", self.features))
         extractors = options.make_extractors()
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for extractor in extractors:
@@ -115,7 +106,7 @@ class ExtractLocal(StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Match(Reading, StageCommand):
+class Match(Reading, Choosing, Working):
     """Match image pairs and verify the matches: by the known poses of map images, or by two-view
     geometry for queries."""
 
@@ -157,7 +148,7 @@ class Match(Reading, StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Triangulate(Reading, StageCommand):
+class Triangulate(Reading, Choosing, Working):
     """Triangulate verified matches of images with known poses into a kapture map."""
 
     input: Input
@@ -197,7 +188,7 @@ def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> l
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractGlobal(Reading, StageCommand):
+class ExtractGlobal(Reading, Choosing, Working):
     """Compute global features of all images: VLAD trained on the map, or networks."""
 
     input: Input
@@ -213,19 +204,21 @@ class ExtractGlobal(Reading, StageCommand):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        choices = self.options(self.named("global_features", self.features)).global_features
+        options = self.options(_named(self.preset, "global_features", self.features))
         folders = [self.kapture_map(self.input), *map(self.kapture, self.query)]
         extractors = {
-            picked.name: picked.make(self.placement()) for picked in choices if not picked.is_vlad
+            choice.name: choice.make(options.placement)
+            for choice in options.global_features
+            if not choice.is_vlad
         }
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
-            for choice in choices:
+            for choice in options.global_features:
                 if choice.is_vlad:
-                    options = choice.vlad_options()
-                    asked = self.local_type or options.local_type
+                    vlad = choice.vlad_options()
+                    asked = self.local_type or vlad.local_type
                     local_type = only_type(folders[0], "descriptors", asked)
                     type_name = vlad_type(local_type)
-                    counts = extract_vlad(folders[0], folders, local_type, out, options, work=work)
+                    counts = extract_vlad(folders[0], folders, local_type, out, vlad, work=work)
                 else:
                     extractor = extractors[choice.name]
                     type_name = extractor.name
@@ -234,7 +227,7 @@ class ExtractGlobal(Reading, StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsMapping(Reading, StageCommand):
+class PairsMapping(Reading, Choosing, Working):
     """Choose pairs of map images to match."""
 
     input: Input
@@ -278,7 +271,7 @@ class PairsMapping(Reading, StageCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsQuery(Reading, StageCommand):
+class PairsQuery(Reading, Choosing, Working):
     """Choose the map images to match with each query."""
 
     input: Input
