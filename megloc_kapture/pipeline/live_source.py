@@ -36,7 +36,7 @@ from megloc_kapture.stages.global_features import (
 )
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.image_pairs import Retrieval, most_similar, vectors_of
-from megloc_kapture.stages.local_features import extract_all, read_frame, read_image_of
+from megloc_kapture.stages.local_features import extract_all, read_frame, read_stored_image
 from megloc_kapture.stages.map_features import rows_found_again
 from megloc_kapture.stages.matches import (
     CACHED_IMAGES,
@@ -508,8 +508,7 @@ class MapMatching:
         return np.stack([self._map_image(name).describe(extractor) for name in images])
 
     def _map_image(self, name: str) -> QueryImage:
-        folder = self._map.folder
-        pixels = read_image_of(folder.image_path(name), folder.read().camera_of(name))
+        pixels = read_stored_image(self._map.folder, name)
         return self._preprocessor.of(Query(self._map.camera(name), pixels, name))
 
     def _vlad(self, kind: _GlobalType) -> tuple[Vocabulary, VladSettings]:

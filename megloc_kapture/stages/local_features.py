@@ -138,8 +138,13 @@ def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: s
 
 def read_frame(folder: KaptureFolder, image: str, *, margin_px: float = 0.0) -> Frame:
     """Read an image, uint8 (H, W, 3) RGB, and its mask; see :func:`read_mask`."""
-    pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
+    pixels = read_stored_image(folder, image)
     return pixels, read_mask(mask_path(folder, image), pixels.shape[:2], margin_px=margin_px)
+
+
+def read_stored_image(folder: KaptureFolder, image: str) -> NDArray[np.uint8]:
+    """Read an image of a folder, uint8 (H, W, 3) RGB."""
+    return read_image_of(folder.image_path(image), folder.read().camera_of(image))
 
 
 def read_image_of(path: Path, camera: Camera) -> NDArray[np.uint8]:

@@ -24,7 +24,7 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
-from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.stages.local_features import read_stored_image
 from megloc_kapture.stages.scene import poses_through_rig
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Failure, Fallback, LocalizationResult, Pose, RigidTransform
@@ -151,7 +151,7 @@ def unreadable_image(name: str, reason: str) -> Failure:
 
 def _fault(folder: KaptureFolder, name: str) -> str:
     try:
-        read_image_of(folder.image_path(name), folder.read().camera_of(name))
+        read_stored_image(folder, name)
     except DataError as error:
         return error.message
     return ""

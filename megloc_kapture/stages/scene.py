@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +25,7 @@ from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.map_check import ObservedKeypoints
 from megloc_kapture.plugins import DepthView
-from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
+from megloc_kapture.stages.local_features import mask_path, read_mask, read_stored_image
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 _ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids", "covariances")
@@ -292,52 +292,27 @@ def _between(
 _NO_POINTS = np.zeros(0, np.int64)
 
 
-class _Images:
-    def __init__(self, folder: KaptureFolder) -> None:
-        self.folder = folder
-
-    @cached_property
-    def poses(self) -> dict[str, RigidTransform]:
-        return self.folder.read().poses()
-
-    def camera(self, name: str) -> Camera:
-        return self.folder.read().camera_of(name)
-
-    def image(self, name: str) -> NDArray[np.uint8]:
-        return read_image_of(self.folder.image_path(name), self.camera(name))
-
-    def mask(self, name: str) -> NDArray[np.bool_] | None:
-        camera = self.camera(name)
-        return read_mask(mask_path(self.folder, name), (camera.height, camera.width))
-
-    def depth(self, name: str) -> DepthView | None:
-        record = self._depth_records.get(name)
-        if record is None:
-            return None
-        depth_m = read_depth(self.folder, record)
-        return DepthView(record.camera, depth_m, record.image_from_depth)
-
-    def points(self, name: str) -> NDArray[np.float64]:
-        seen = [index.observed(name)[1] for index in self._indices]
-        return self.folder.points3d()[:, :3][np.unique(np.concatenate([_NO_POINTS, *seen]))]
-
-    @cached_property
-    def _depth_records(self) -> dict[str, DepthRecord]:
-        return depth_records(self.folder.read())
-
-    @cached_property
-    def _indices(self) -> list[MapIndex]:
-        return [index_map(self.folder, name) for name in self.folder.observations()]
+@lru_cache(maxsize=4)
+def _depth_records_of(folder: KaptureFolder) -> dict[str, DepthRecord]:
+    return depth_records(folder.read())
 
 
 @lru_cache(maxsize=4)
-def _images_of(folder: KaptureFolder) -> _Images:
-    return _Images(folder)
+def _indices_of(folder: KaptureFolder) -> list[MapIndex]:
+    return [index_map(folder, local_type) for local_type in folder.observations()]
 
 
 def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
     """Return the depth taken with an image, or None."""
-    return _images_of(folder).depth(name)
+    record = _depth_records_of(folder).get(name)
+    if record is None:
+        return None
+    return DepthView(record.camera, read_depth(folder, record), record.image_from_depth)
+
+
+def _mask_of(folder: KaptureFolder, name: str) -> NDArray[np.bool_] | None:
+    camera = folder.read().camera_of(name)
+    return read_mask(mask_path(folder, name), (camera.height, camera.width))
 
 
 class KaptureScene:
@@ -354,20 +329,31 @@ class KaptureScene:
         *,
         map_camera: Callable[[str], Camera] | None = None,
     ) -> None:
-        self._map = _images_of(mapping)
+        self._map = mapping
+        self.map_camera = map_camera or mapping.read().camera_of
         if isinstance(query, KaptureFolder):
-            queries = _images_of(query)
-            self.query_image, self.query_mask = queries.image, queries.mask
-            self.query_depth = queries.depth
+            self.query_image = lambda name: read_stored_image(query, name)
+            self.query_mask = lambda name: _mask_of(query, name)
+            self.query_depth = lambda name: depth_of(query, name)
         elif query is not None:
             self.query_image = lambda name: query[name].pixels
             self.query_mask = lambda name: query[name].mask
             self.query_depth = lambda name: query[name].depth
-        self.map_image = self._map.image
-        self.map_mask = self._map.mask
-        self.map_depth = self._map.depth
-        self.map_points = self._map.points
-        self.map_camera = map_camera or self._map.camera
+
+    def map_image(self, name: str) -> NDArray[np.uint8]:
+        return read_stored_image(self._map, name)
+
+    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
+        return _mask_of(self._map, name)
+
+    def map_depth(self, name: str) -> DepthView | None:
+        return depth_of(self._map, name)
+
+    def map_points(self, name: str) -> NDArray[np.float64]:
+        seen = [index.observed(name)[1] for index in _indices_of(self._map)]
+        return self._map.points3d()[:, :3][np.unique(np.concatenate([_NO_POINTS, *seen]))]
 
     def map_pose(self, name: str) -> RigidTransform:
-        return self._map.poses[name]
+        pose = self._map.read().cam_from_world(name)
+        assert pose is not None
+        return pose

@@ -39,7 +39,7 @@ from megloc_kapture.mvs.views import (
     stereo_view,
 )
 from megloc_kapture.plugins import StereoView
-from megloc_kapture.stages.local_features import read_image_of
+from megloc_kapture.stages.local_features import read_stored_image
 from megloc_kapture.stages.scene import depth_of
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import RigidTransform
@@ -205,7 +205,7 @@ def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDA
     data, depth = folder.read(), depth_of(folder, image)
     pose = data.cam_from_world(image)
     assert depth is not None and pose is not None
-    pixels = read_image_of(folder.image_path(image), data.camera_of(image))
+    pixels = read_stored_image(folder, image)
     longer = max(depth.camera.width, depth.camera.height)
     view = stereo_view(pixels, data.camera_of(image), pose, None, longer)
     return view, depth.depth_m
