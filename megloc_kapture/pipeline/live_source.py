@@ -180,7 +180,7 @@ class LocalType:
             num_found={name: pair.num_found for name, pair in pairs.items()},
             name=image.query.name,
         )
-        skipped = next((tried.skipped for tried in retried.tried), "")
+        skipped = retried.skipped
         remark = f"guided pyramid matching: skipped {skipped}" if skipped else ""
         return np.concatenate([query.keypoints_px, retried.added_px]), retried.matches, remark
 

@@ -19,7 +19,7 @@ from functools import partial
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,32 +147,24 @@ def _described(skipped: Mapping[ImageVariant, str]) -> str:
     return "; ".join(f"{' '.join(map(str, some))}: {reason}" for reason, some in by_reason.items())
 
 
-class TriedPair(NamedTuple):
-    """Numbers of matches and added keypoints of a pair that was matched again."""
-
-    pair: tuple[str, str]
-    before: int
-    after: int
-    added: int
-    skipped: str
-
-
-def _tried(pair: tuple[str, str], before: int, combined: Combined, skipped: str) -> TriedPair:
-    return TriedPair(pair, before, len(combined.matches), sum(map(len, combined.added)), skipped)
+def _counts(before: int = 0, combined: Combined | None = None) -> Counter[str]:
+    """Return counts for the log of a pair that was matched again, or of no pair."""
+    after = 0 if combined is None else len(combined.matches)
+    return Counter(
+        pairs_tried=int(combined is not None),
+        pairs_gained=int(after > before),
+        matches_before=before,
+        matches_after=after,
+        keypoints_added=0 if combined is None else sum(map(len, combined.added)),
+    )
 
 
-def _sums(local_type: str, tried: Sequence[TriedPair]) -> dict[str, float]:
-    """Warn about skipped variants, and return sums for the log."""
-    if skipped := Counter(pair.skipped for pair in tried if pair.skipped):
+def _warn_of_skipped(local_type: str, skipped: Counter[str]) -> None:
+    """Warn about skipped variants, given the number of pairs by reason."""
+    del skipped[""]
+    if skipped:
         message = "guided pyramid of %s: variants of %d pairs are skipped, most often %s"
         _log.warning(message, local_type, skipped.total(), skipped.most_common(1)[0][0])
-    return {
-        "pairs_tried": len(tried),
-        "pairs_gained": sum(pair.after > pair.before for pair in tried),
-        "matches_before": sum(pair.before for pair in tried),
-        "matches_after": sum(pair.after for pair in tried),
-        "keypoints_added": sum(pair.added for pair in tried),
-    }
 
 
 class PyramidFeatures:
@@ -220,13 +212,14 @@ class RetriedQuery:
     """A query after guided pyramid matching.
 
     The added keypoints (A, C) and descriptors (A, D) follow those of the query. ``matches`` are in
-    the order of the candidates.
+    the order of the candidates. ``skipped`` has the reasons of skipped variants.
     """
 
     added_px: NDArray[np.float32]
     added_descriptors: NDArray[Any]
     matches: list[ImageMatches]
-    tried: list[TriedPair]
+    counts: Counter[str]
+    skipped: str
 
 
 def retry_query(
@@ -256,7 +249,8 @@ def retry_query(
     ]
     mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
-        return RetriedQuery(query.keypoints_px[:0], query.descriptors[:0], list(matches), [])
+        none = query.keypoints_px[:0], query.descriptors[:0]
+        return RetriedQuery(*none, list(matches), _counts(), "")
     assert not isinstance(verification, KnownPoseOptions)
 
     def judge(other: str, features: Features) -> PairVerifier:
@@ -272,18 +266,18 @@ def retry_query(
     keypoints = KeypointUnion(query.keypoints_px)
     descriptors: list[NDArray[Any]] = []
     richer: list[ImageMatches] = []
-    tried = []
+    counts = _counts()
     for other, pairs, scores in matches:
         if other in of_other:
             variants = of_other[other]
             of_image = [(0, each) for each in variants]
             combined = combine((pairs, scores), of_image, mode, (keypoints, None))
-            tried.append(_tried((name, other), len(pairs), combined, skipped))
+            counts.update(_counts(len(pairs), combined))
             descriptors += [variants[at].descriptors[k] for at, k in combined.added[0].tolist()]
             pairs, scores = combined.matches, combined.scores
         richer.append((other, pairs, scores))
     added = np.array(descriptors, query.descriptors.dtype).reshape(-1, query.descriptors.shape[1])
-    return RetriedQuery(keypoints.added(), added, richer, tried)
+    return RetriedQuery(keypoints.added(), added, richer, counts, skipped)
 
 
 _Pair = tuple[str, str]
@@ -313,10 +307,10 @@ def pyramid_mapping(
 
     named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
     stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
-    counts = {pair: len(stored.read(*pair)[0]) for pair in named}
+    verified = {pair: len(stored.read(*pair)[0]) for pair in named}
     num_of = num_found or {}
     is_hard, mode = method.options.is_hard, method.options.mode
-    hard = [p for p in named if is_hard(num_of.get(p, counts[p]), counts[p]) and can_gain(*p)]
+    hard = [p for p in named if is_hard(num_of.get(p, verified[p]), verified[p]) and can_gain(*p)]
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
         others[a][0].append(b)
@@ -334,7 +328,7 @@ def pyramid_mapping(
             matched_of[image, other] = of_pair, skipped
     unions: dict[str, KeypointUnion] = {}
     added: dict[str, list[NDArray[Any]]] = defaultdict(list)  # descriptors
-    tried, hard_pairs = [], set(hard)
+    counts, reasons, hard_pairs = _counts(), Counter[str](), set(hard)
     with MatchesWriter(output, pyramid_type(local_type), orphan=True) as writer:
         for pair in named:
             matches, scores = stored.read(*pair)
@@ -349,19 +343,20 @@ def pyramid_mapping(
                 combined = combine((matches, scores), variants, mode, both)
                 for image, new in zip(pair, combined.added, strict=True):
                     added[image] += [variants[at][1].descriptors[row] for at, row in new.tolist()]
-                skipped = " | ".join(reason for _, reason in directed if reason)
-                tried.append(_tried(pair, len(matches), combined, skipped))
+                reasons[" | ".join(reason for _, reason in directed if reason)] += 1
+                counts.update(_counts(len(matches), combined))
                 matches, scores = combined.matches, combined.scores
             writer.write(*pair, matches, scores)
     extended = sorted(image for image, descriptors in added.items() if descriptors)
     for image in extended:
         features.write(image, unions[image].added(), np.stack(added[image]))
     features.write_rest()
+    _warn_of_skipped(local_type, reasons)
     return {
         "images_extracted_again": len(jobs),
         "images_extended": len(extended),
         "pairs": len(named),
-        **_sums(local_type, tried),
+        **counts,
     }
 
 
@@ -430,22 +425,25 @@ def pyramid_queries(
     features = PyramidFeatures(output, query, local_type)
     retry = partial(_retry, query, mapping, types, method)
     plugins = method.extractor, method.matcher
-    tried: list[TriedPair] = []
-    extended = 0
+    counts, skipped = _counts(), Counter[str]()
+    retried = extended = 0
     with MatchesWriter(output, larger, orphan=True) as writer:
         results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
         for (image, *_), result in zip(jobs, results, strict=True):
             for matches in result.matches:
                 writer.write(image, *matches)
             features.write(image, result.added_px, result.added_descriptors)
-            tried += result.tried
+            counts.update(result.counts)
+            skipped[result.skipped] += result.counts["pairs_tried"]
+            retried += result.counts["pairs_tried"] > 0
             extended += len(result.added_px) > 0
     features.write_rest()
+    _warn_of_skipped(local_type, skipped)
     return {
-        "images_extracted_again": len({pair.pair[0] for pair in tried}),
+        "images_extracted_again": retried,
         "images_extended": extended,
         "pairs": sum(map(len, candidates.values())),
-        **_sums(local_type, tried),
+        **counts,
     }
 
 
