@@ -169,7 +169,7 @@ class MapImage:
     name: str
     camera: Camera
     cam_from_world: RigidTransform
-    keypoints_px: NDArray[np.float32]
+    keypoints_px: NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)

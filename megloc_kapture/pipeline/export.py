@@ -48,6 +48,10 @@ from megloc_kapture.stages.local_features import check_size
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 _log = logging.getLogger(__name__)
+
+Points = NDArray[np.float64]
+"""Exported points (N, 6) as X Y Z R G B."""
+
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
 # fx fy cx cy and distortion, in COLMAP's parameter order
 _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -60,73 +64,62 @@ _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class PosedImage:
-    """An image with its pose, and a camera in COLMAP's convention.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ExportedImage(MapImage):
+    """An exported image with its observations.
 
-    The observations are ``rows`` of ``keypoints_px`` (K, 2), and ``points``, which are rows of the
-    scene's points; both are int (M,).
+    They are ``rows`` of the keypoints, and ``points``, which are rows of the exported points; both
+    are int (M,).
     """
 
-    name: str
-    path: Path | None
-    camera: Camera
-    cam_from_world: RigidTransform
+    path: Path
     timestamp: int
     sensor: str
     is_query: bool
-    keypoints_px: NDArray[np.floating]
     rows: NDArray[np.integer]
     points: NDArray[np.integer]
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Exported images and points, float64 (N, 6) as X Y Z R G B."""
-
-    images: Sequence[PosedImage]
-    points: NDArray[np.float64]
-
-
-def export_colmap(scene: Scene, output: Path) -> None:
+def export_colmap(images: Sequence[ExportedImage], points: Points, output: Path) -> None:
     """Write a binary COLMAP model with one rig per camera; queries have no observations."""
-    names = [image.name for image in scene.images]
+    names = [image.name for image in images]
     if len(set(names)) != len(names):
         twice = min(name for name in names if names.count(name) > 1)
         raise DataError(
             f"two images are named {twice!r}, in map and queries, or because / becomes _; COLMAP "
             "needs unique names"
         )
-    images = [MapImage(i.name, i.camera, i.cam_from_world, i.keypoints_px) for i in scene.images]
-    observed = [(image.rows, image.points) for image in scene.images]
-    write_model(output, images, observed, scene.points[:, :3], scene.points[:, 3:])
+    observed = [(image.rows, image.points) for image in images]
+    write_model(output, images, observed, points[:, :3], points[:, 3:])
 
 
-def export_undistorted(scene: Scene, output: Path) -> None:
+def export_undistorted(images: Sequence[ExportedImage], points: Points, output: Path) -> None:
     """Write PINHOLE cameras, ``images/`` and ``sparse/0`` for Gaussian splatting.
 
     ``/`` in image names becomes ``_``, because the original Gaussian splatting ignores folders.
     """
-    images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
+    images = [replace(image, name=image.name.replace("/", "_")) for image in images]
     for image in images:
         path = _file_of(image, "undistorting")
         check_size(image_size(path), image.camera, path)
     with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
         model, links = Path(scratch) / "model", Path(scratch) / "images"
-        export_colmap(Scene(images, scene.points), model)
+        export_colmap(images, points, model)
         links.mkdir()
         for image in images:
-            (links / image.name).symlink_to(Path(image.path or "").resolve())
+            (links / image.name).symlink_to(image.path.resolve())
         undistort_model(model, links, output)
 
 
-def export_nerfstudio(scene: Scene, output: Path, *, final: Path | None = None) -> None:
+def export_nerfstudio(
+    images: Sequence[ExportedImage], points: Points, output: Path, *, final: Path | None = None
+) -> None:
     """Write ``transforms.json`` and ``sparse_pc.ply`` into ``output``.
 
     Image paths are relative to ``final``, the folder to which ``output`` is moved later.
     """
     frames = []
-    for image in scene.images:
+    for image in images:
         path = _file_of(image, "nerfstudio")
         world_from_cam = image.cam_from_world.inverse().matrix()
         file = os.path.relpath(path.resolve(), (final or output).resolve())
@@ -138,21 +131,20 @@ def export_nerfstudio(scene: Scene, output: Path, *, final: Path | None = None) 
             }
         )
     content: dict[str, Any] = {"frames": frames}
-    if len(scene.points):
-        write_ply(output / "sparse_pc.ply", scene.points[:, :3], scene.points[:, 3:])
+    if len(points):
+        write_ply(output / "sparse_pc.ply", points[:, :3], points[:, 3:])
         content["ply_file_path"] = "sparse_pc.ply"
     write_bytes(output / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
 
 
-def _file_of(image: PosedImage, who: str) -> Path:
-    if image.path is None or not image.path.is_file():
-        raise DataError(f"{who} needs the file of {image.name!r}", path=image.path)
+def _file_of(image: ExportedImage, who: str) -> Path:
+    require(image.path.is_file(), f"{who} needs the file of {image.name!r}", path=image.path)
     return image.path
 
 
-def export_tum(scene: Scene, output: Path) -> None:
+def export_tum(images: Sequence[ExportedImage], output: Path) -> None:
     rows = []
-    for image in sorted(scene.images, key=lambda record: record.timestamp):
+    for image in sorted(images, key=lambda record: record.timestamp):
         world_from_cam = image.cam_from_world.inverse()
         w, *vector = world_from_cam.quat_wxyz
         numbers = (*world_from_cam.translation, *vector, w)
@@ -161,7 +153,7 @@ def export_tum(scene: Scene, output: Path) -> None:
     if len(set(stamps)) != len(stamps):
         raise DataError(
             "several images share a timestamp; choose one camera with --sensor: "
-            f"{', '.join(sorted({image.sensor for image in scene.images}))}"
+            f"{', '.join(sorted({image.sensor for image in images}))}"
         )
     exponent = _exponent_of_seconds(max(stamps))
     text = "".join(f"{Decimal(stamp).scaleb(exponent):f} {row}\n" for stamp, row in rows)
@@ -178,19 +170,19 @@ def _exponent_of_seconds(timestamp: int) -> int:
     return next((exponent for limit, exponent in limits if timestamp >= limit), 0)
 
 
-def export_ply(scene: Scene, output: Path) -> None:
+def export_ply(images: Sequence[ExportedImage], points: Points, output: Path) -> None:
     """Write the points and the camera frusta, whose depth is a twentieth of the median depth."""
     depths = [
-        float(np.median(image.cam_from_world.apply(scene.points[image.points, :3])[:, 2]))
-        for image in scene.images
+        float(np.median(image.cam_from_world.apply(points[image.points, :3])[:, 2]))
+        for image in images
         if len(image.points)
     ]
-    centres = np.array([image.cam_from_world.center() for image in scene.images]).reshape(-1, 3)
+    centres = np.array([image.cam_from_world.center() for image in images]).reshape(-1, 3)
     extent = float(np.ptp(centres, axis=0).max()) if len(centres) > 1 else 1.0
     depth = 0.05 * (float(np.median(depths)) if depths else extent or 1.0)
-    vertices, colours = [scene.points[:, :3]], [scene.points[:, 3:]]
+    vertices, colours = [points[:, :3]], [points[:, 3:]]
     edges: list[tuple[int, int]] = []
-    for image in scene.images:
+    for image in images:
         first = sum(len(part) for part in vertices)
         vertices.append(frustum(image.camera, image.cam_from_world, depth))
         colours.append(np.tile(_QUERY_COLOUR if image.is_query else _MAP_COLOUR, (5, 1)))
@@ -259,31 +251,31 @@ def export(
     check_option(
         not undistort or name == "colmap", f"--undistort is an option of colmap, not of {name}"
     )
-    scene = _scene(map, query, sensor, trajectory=name == "tum")
-    require(scene.images, "no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
+    images, points = _read(map, query, sensor, trajectory=name == "tum")
+    require(images, "no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
         inputs = (map.folder.root if isinstance(map, KaptureMap) else map, query)
         with staged_output(output, kind=_KIND, force=force, inputs=inputs) as out:
             if undistort:
-                export_undistorted(scene, out)
+                export_undistorted(images, points, out)
             elif name == "colmap":
-                _hint_at_undistort(scene)
-                export_colmap(scene, out)
+                _hint_at_undistort(images)
+                export_colmap(images, points, out)
             else:
-                export_nerfstudio(scene, out, final=output)
-        return len(scene.images)
+                export_nerfstudio(images, points, out, final=output)
+        return len(images)
     if output.exists() and not force:
         raise OutputError(f"{output}: exists; --force overwrites it")
     if name == "tum":
-        export_tum(scene, output)
+        export_tum(images, output)
     else:
-        export_ply(scene, output)
-    return len(scene.images)
+        export_ply(images, points, output)
+    return len(images)
 
 
-def _hint_at_undistort(scene: Scene) -> None:
-    models = {image.camera.model for image in scene.images}
+def _hint_at_undistort(images: Sequence[ExportedImage]) -> None:
+    models = {image.camera.model for image in images}
     if distorted := sorted(models - {"PINHOLE", "SIMPLE_PINHOLE"}):
         _log.warning(
             "programs for Gaussian splatting do not support %s cameras; --undistort writes PINHOLE "
@@ -292,15 +284,15 @@ def _hint_at_undistort(scene: Scene) -> None:
         )
 
 
-def _scene(
+def _read(
     given: KaptureMap | Path | str | None,
     query: Path | str | None,
     sensor: str | None,
     *,
     trajectory: bool,
-) -> Scene:
+) -> tuple[list[ExportedImage], Points]:
     opened: KaptureMap | None = None
-    images: list[PosedImage] = []
+    images: list[ExportedImage] = []
     if given is not None and not (trajectory and query is not None):
         if isinstance(given, KaptureMap):
             opened = given
@@ -313,12 +305,12 @@ def _scene(
     if query is not None:
         images += _posed_images(KaptureFolder(query), opened, sensor, is_query=True)
     points = np.zeros((0, 6)) if opened is None else opened.folder.points3d()
-    return Scene(images, points)
+    return images, points
 
 
 def _posed_images(
     folder: KaptureFolder, opened: KaptureMap | None, sensor: str | None, *, is_query: bool
-) -> list[PosedImage]:
+) -> list[ExportedImage]:
     data, (scaled, errors) = folder.read(), cameras_of_folder(folder)
     if errors:
         raise errors[0]
@@ -339,7 +331,7 @@ def _posed_images(
             keypoints = keypoints * (width / camera.width, height / camera.height)
             camera = scaled_camera(camera, width, height)
         posed.append(
-            PosedImage(
+            ExportedImage(
                 name=image,
                 path=folder.image_path(image),
                 camera=camera,

@@ -14,8 +14,7 @@ from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.pipeline.export import (
-    PosedImage,
-    Scene,
+    ExportedImage,
     export,
     export_colmap,
     export_nerfstudio,
@@ -29,19 +28,24 @@ from megloc_kapture.values import Camera, RigidTransform
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 NO_ROWS = np.zeros(0, np.int64)
+NO_POINTS = np.zeros((0, 6))
 
 
 def image(
-    camera: Camera, pose: RigidTransform, *, timestamp: int = 0, path: Path | None = None
-) -> PosedImage:
-    pixels = np.zeros((0, 2))
-    return PosedImage(
-        "a.jpg", path, camera, pose, timestamp, "cam", False, pixels, NO_ROWS, NO_ROWS
+    camera: Camera, pose: RigidTransform, *, timestamp: int = 0, path: Path = Path("missing.jpg")
+) -> ExportedImage:
+    return ExportedImage(
+        name="a.jpg",
+        camera=camera,
+        cam_from_world=pose,
+        keypoints_px=np.zeros((0, 2), np.float32),
+        path=path,
+        timestamp=timestamp,
+        sensor="cam",
+        is_query=False,
+        rows=NO_ROWS,
+        points=NO_ROWS,
     )
-
-
-def scene(*images: PosedImage) -> Scene:
-    return Scene(images, np.zeros((0, 6)))
 
 
 def centred_at(centre: tuple[float, float, float]) -> RigidTransform:
@@ -64,7 +68,7 @@ def test_cameras_of_nerfstudio_project_like_opencv(camera: Camera, tmp_path: Pat
 
     (tmp_path / "a.jpg").touch()
     posed = image(camera, RigidTransform.identity(), path=tmp_path / "a.jpg")
-    export_nerfstudio(scene(posed), tmp_path)
+    export_nerfstudio([posed], NO_POINTS, tmp_path)
     frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
     matrix = np.array(
         [[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1.0]]
@@ -82,7 +86,7 @@ def test_cameras_of_nerfstudio_project_like_opencv(camera: Camera, tmp_path: Pat
 def test_tum_timestamps_are_seconds_or_frame_numbers(tmp_path: Path) -> None:
     camera, pose = Camera.pinhole(6, 4, 5), RigidTransform.identity()
     for timestamp, column in ((1602074877390449152, "1602074877.390449152"), (17, "17")):
-        export_tum(scene(image(camera, pose, timestamp=timestamp)), tmp_path / "a.tum")
+        export_tum([image(camera, pose, timestamp=timestamp)], tmp_path / "a.tum")
         assert (tmp_path / "a.tum").read_text().split()[0] == column
 
 
@@ -99,7 +103,7 @@ def test_undistorted_model_for_gaussian_splatting(tmp_path: Path) -> None:
         posed = image(camera, pose, path=tmp_path / name)
         images.append(replace(posed, name=name, keypoints_px=pixels, rows=rows, points=rows))
     (out := tmp_path / "out").mkdir()
-    export_undistorted(Scene(images, points), out)
+    export_undistorted(images, points, out)
 
     model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
     model.update_point_3d_errors()
@@ -117,14 +121,14 @@ def test_images_that_a_format_cannot_store_are_refused(tmp_path: Path) -> None:
     odd = Camera("THIN_PRISM_FISHEYE", 640, 480, (500, 500, 320, 240, *[0.0] * 8))
     pose = RigidTransform.identity()
     with pytest.raises(DataError, match="no camera model THIN_PRISM_FISHEYE; undistort"):
-        export_nerfstudio(scene(image(odd, pose, path=tmp_path / "a.jpg")), tmp_path)
+        export_nerfstudio([image(odd, pose, path=tmp_path / "a.jpg")], NO_POINTS, tmp_path)
     with pytest.raises(DataError, match="needs the file"):
-        export_nerfstudio(scene(image(Camera.pinhole(6, 4, 5), pose)), tmp_path)
+        export_nerfstudio([image(Camera.pinhole(6, 4, 5), pose)], NO_POINTS, tmp_path)
     two = image(Camera.pinhole(6, 4, 5), pose), image(Camera.pinhole(6, 4, 5), pose)
     with pytest.raises(DataError, match="share a timestamp"):
-        export_tum(scene(*two), tmp_path / "a.tum")
+        export_tum(two, tmp_path / "a.tum")
     with pytest.raises(DataError, match="two images are named 'a.jpg', .* because / becomes _"):
-        export_colmap(scene(*two), tmp_path / "model")
+        export_colmap(two, NO_POINTS, tmp_path / "model")
 
 
 def test_corners_of_a_frustum_project_to_those_of_the_image() -> None:
