@@ -112,29 +112,10 @@ def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, M
     return {source: mask for source, mask in masks.items() if mask is not None}
 
 
-class StandingMasks:
-    """Cached per-camera masks: fixed masks, and static regions by sensor id."""
-
-    def __init__(self, fixed: Sequence[FixedMask], regions: Mapping[str, UnchangingRegion]) -> None:
-        self._fixed, self._regions = tuple(fixed), dict(regions)
-        self._used: set[FixedMask] = set()
-        self._standing = lru_cache(maxsize=64)(_standing)
-
-    def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
-        """Return an image's per-camera masks by source, bool (H, W), in original pixels."""
-        region = self._regions.get(sensor_id)
-        fitting = [fixed for fixed in self._fixed if fixed.is_for(sensor_id, image)]
-        self._used.update(fitting)
-        applied = tuple(fixed for fixed in fitting if not (fixed.fallback and region))
-        return self._standing(applied, region, camera.width, camera.height)
-
-    def unused(self) -> list[FixedMask]:
-        return [fixed for fixed in self._fixed if fixed not in self._used]
-
-
-def _standing(
+def _standing_masks(
     fixed: Sequence[FixedMask], region: UnchangingRegion | None, width: int, height: int
 ) -> dict[str, Mask]:
+    """Return the masks of a camera by source, bool (H, W), in original pixels."""
     masks = {}
     if fixed:
         masks["fixed"] = np.logical_and.reduce([_drawn(each, width, height) for each in fixed])
@@ -364,8 +345,12 @@ def preprocess_images(
     regions: dict[str, UnchangingRegion] = {}
     if options.masks.unchanging:
         regions = find_unchanging_regions(folder, sequences, work=work)
-    remarks = _remarks(regions, any(fixed.fallback for fixed in options.masks.fixed))
-    standing = StandingMasks(options.masks.fixed, regions)
+    fixed = options.masks.fixed
+    remarks = _remarks(regions, any(mask.fallback for mask in fixed))
+    sensor_of = {image: data.record_of(image)[1] for image in images}
+    for mask in fixed:
+        if not any(mask.is_for(sensor, image) for image, sensor in sensor_of.items()):
+            remarks.append(f"a fixed mask matches no image: {mask.camera}")
 
     _unlink_folders(output)
     write_sensors(output, _with_cameras(data, plans))
@@ -374,15 +359,20 @@ def preprocess_images(
         what = {"classes": list(classes.segmenter.classes), "dynamic": list(classes.dynamic)}
         write_json(output / "sensors" / CLASSES / CLASSES_FILE, what)
 
-    def standing_of(image: str) -> Mapping[str, Mask]:
-        sensor_id = data.record_of(image)[1]
-        return standing.of(sensor_id, image, plans[sensor_id].original)
+    standing_masks = lru_cache(maxsize=64)(_standing_masks)
 
     def jobs() -> Iterator[tuple[str, Path, FramePlan, bool, dict[str, Path], Mapping[str, Mask]]]:
         for image in images:
-            plan = plans[data.record_of(image)[1]]
+            sensor = sensor_of[image]
+            plan, region = plans[sensor], regions.get(sensor)
             link = not (linked or plan.changes_pixels)
-            yield image, folder.image_path(image), plan, link, files[image], standing_of(image)
+            applied = tuple(
+                mask
+                for mask in fixed
+                if mask.is_for(sensor, image) and not (mask.fallback and region)
+            )
+            standing = standing_masks(applied, region, plan.original.width, plan.original.height)
+            yield image, folder.image_path(image), plan, link, files[image], standing
 
     plugins = () if classes is None else (classes.segmenter,)
     process = partial(_process, output, classes)
@@ -392,7 +382,6 @@ def preprocess_images(
     for image_shares in results:
         num_masked += bool(image_shares)
         shares.update(image_shares)
-    remarks += [f"a fixed mask matches no image: {mask.camera}" for mask in standing.unused()]
     for remark in remarks:
         _log.warning("%s", remark)
     return {
