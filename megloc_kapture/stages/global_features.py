@@ -34,7 +34,7 @@ from megloc_kapture.plugin_loading import (
 )
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
-from megloc_kapture.stages.local_features import images_of, read_image_of
+from megloc_kapture.stages.local_features import Job, images_of, read_stored_image, size_of
 from megloc_kapture.stages.map_features import (
     MEAN_FILE,
     PROJECTION_FILE,
@@ -58,7 +58,7 @@ from megloc_kapture.stages.work import (
     ordered_map,
     resumed_label,
 )
-from megloc_kapture.values import Camera, Options
+from megloc_kapture.values import Options
 
 
 class VladSettings(Options):
@@ -122,9 +122,7 @@ def extract_vlad(
     return {"images": len(folder_of), "clusters": num_centres, "dimensions": size}
 
 
-def _aggregate(
-    local_type: str, place: Path, run_id: str, job: tuple[str, KaptureFolder]
-) -> NDArray[np.float32]:
+def _aggregate(local_type: str, place: Path, run_id: str, job: Job) -> NDArray[np.float32]:
     vocabulary, settings = _read_once(place, run_id)
     image, folder = job
     return aggregate(_descriptors(folder, local_type, image), vocabulary, settings.options)
@@ -197,9 +195,6 @@ class GlobalFeaturesChoice(PluginChoice):
         return self.make().name
 
 
-_Job = tuple[str, Path, Camera]
-
-
 def extract_global_features(
     folders: Sequence[KaptureFolder],
     extractor: GlobalFeatureExtractor,
@@ -210,18 +205,15 @@ def extract_global_features(
     """Write global features of all images (orphan layout); return counts for the log."""
     folder_of = images_of(folders, "describe")
     is_written = partial(has_features, output, "global_features", extractor.name)
-    jobs = [
-        (image, folder_of[image].image_path(image), folder_of[image].read().camera_of(image))
-        for image in work.unfinished(folder_of, is_written)
-    ]
-    jobs.sort(key=_size)  # images of equal size can share a batch
+    jobs = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
+    jobs.sort(key=size_of)  # images of equal size can share a batch
     describe = partial(_describe, extractor)
-    steps: Batched[_Job, NDArray[np.float32]] = Batched(
-        _read, describe, extractor, "describe_many", _size
+    steps: Batched[Job, NDArray[np.float32]] = Batched(
+        _read, describe, extractor, "describe_many", size_of
     )
     writer: FeatureWriter | None = None
     results = work.map(steps, jobs, resumed_label(extractor.name, len(folder_of), len(jobs)))
-    for (image, *_), vector in zip(jobs, results, strict=True):
+    for (image, _), vector in zip(jobs, results, strict=True):
         if writer is None:
             kind = np.dtype(np.float32)
             config = FeatureConfig(extractor.name, kind, len(vector), metric_type="L2")
@@ -265,18 +257,15 @@ def _checked(extractor: GlobalFeatureExtractor, described: Any, label: str) -> l
     return vectors
 
 
-def _size(job: _Job) -> tuple[int, int]:
-    return job[2].width, job[2].height
-
-
-def _read(job: _Job) -> NDArray[np.uint8]:
-    return read_image_of(*job[1:])
+def _read(job: Job) -> NDArray[np.uint8]:
+    image, folder = job
+    return read_stored_image(folder, image)
 
 
 def _describe(
-    extractor: GlobalFeatureExtractor, jobs: Sequence[_Job], images: Sequence[NDArray[np.uint8]]
+    extractor: GlobalFeatureExtractor, jobs: Sequence[Job], images: Sequence[NDArray[np.uint8]]
 ) -> Sequence[Any]:
-    return list(describe_images(extractor, images, [name for name, *_ in jobs]))
+    return list(describe_images(extractor, images, [image for image, _ in jobs]))
 
 
 class ExtractGlobalFeatures(PipelineStage):

@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,14 +36,7 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, Batched, Work, in_batches, resumed_label
 from megloc_kapture.values import Camera, LocalFeatures
 
-_SIZE = attrgetter("size")
-
-
-class _Job(NamedTuple):
-    image: str
-    folder: KaptureFolder
-    size: tuple[int, int]
-    has_mask: bool
+Job = tuple[str, KaptureFolder]  # an image and its folder
 
 
 def extract_local_features(
@@ -55,36 +48,33 @@ def extract_local_features(
     work: Work = HERE,
 ) -> dict[str, int]:
     """Write features of all images (orphan layout) without masked keypoints; return counts."""
-    jobs = []
-    for image, folder in images_of(folders, "extract features from").items():
-        camera, has_mask = folder.read().camera_of(image), mask_path(folder, image).is_file()
-        jobs.append(_Job(image, folder, (camera.width, camera.height), has_mask))
+    folder_of = images_of(folders, "extract features from")
     is_written = partial(has_features, output, "descriptors", extractor.name)
-    todo = work.unfinished(jobs, lambda job: is_written(job.image))
-    todo.sort(key=_SIZE)  # images of equal size can share a batch
-    steps: Batched[_Job, LocalFeatures] = Batched(
+    todo = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
+    todo.sort(key=size_of)  # images of equal size can share a batch
+    steps: Batched[Job, LocalFeatures] = Batched(
         partial(_read, mask_margin_px),
         partial(_extract, extractor),
         extractor,
         "extract_many",
-        _SIZE,
+        size_of,
     )
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
     masked = 0
-    label = resumed_label(f"{extractor.name} features", len(jobs), len(todo))
+    label = resumed_label(f"{extractor.name} features", len(folder_of), len(todo))
     results = work.map(steps, todo, label)
-    for job, features in zip(todo, results, strict=True):
+    for (image, _), features in zip(todo, results, strict=True):
         writers = writers or _writers(output, extractor, features)
         masked += features.num_masked
-        writers[0].write(job.image, features.keypoints_px)
-        writers[1].write(job.image, features.descriptors)  # last: it marks the image as finished
+        writers[0].write(image, features.keypoints_px)
+        writers[1].write(image, features.descriptors)  # last: it marks the image as finished
     place = feature_folder(output, "keypoints", extractor.name, orphan=True)
     keypoints = FeatureReader("keypoints", extractor.name, [place])
-    counts = {"images": len(jobs), "keypoints": sum(keypoints.length(job.image) for job in jobs)}
-    bound = max_megapixels_of(extractor)
-    if reduced := sum(bounded_size(*job.size, bound) != job.size for job in jobs):
+    counts = {"images": len(folder_of), "keypoints": sum(map(keypoints.length, folder_of))}
+    bound, sizes = max_megapixels_of(extractor), map(size_of, folder_of.items())
+    if reduced := sum(bounded_size(*size, bound) != size for size in sizes):
         counts["images_reduced"] = reduced
-    if with_mask := sum(job.has_mask for job in jobs):
+    if with_mask := sum(mask_path(folder, image).is_file() for image, folder in folder_of.items()):
         counts |= {"images_with_mask": with_mask, "keypoints_masked": masked}
     return counts
 
@@ -113,14 +103,22 @@ def _writers(
     )
 
 
-def _read(margin_px: float, job: _Job) -> Frame:
-    return read_frame(job.folder, job.image, margin_px=margin_px)
+def size_of(job: Job) -> tuple[int, int]:
+    """Return width and height of a job's image."""
+    image, folder = job
+    camera = folder.read().camera_of(image)
+    return camera.width, camera.height
+
+
+def _read(margin_px: float, job: Job) -> Frame:
+    image, folder = job
+    return read_frame(folder, image, margin_px=margin_px)
 
 
 def _extract(
-    extractor: LocalFeatureExtractor, jobs: Sequence[_Job], frames: Sequence[Frame]
+    extractor: LocalFeatureExtractor, jobs: Sequence[Job], frames: Sequence[Frame]
 ) -> list[LocalFeatures]:
-    return extract_all(extractor, frames, [job.image for job in jobs])
+    return extract_all(extractor, frames, [image for image, _ in jobs])
 
 
 def mask_path(folder: KaptureFolder, image: str) -> Path:
