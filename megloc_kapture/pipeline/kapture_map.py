@@ -40,7 +40,8 @@ _SIFT_OF = {True: "sift", False: "rootsift"}
 class MapKeypoints:
     """Keypoints of one type in a map, in COLMAP's convention, and the points that they observe.
 
-    ``index`` holds points and observations as arrays, empty if the type has no points.
+    ``index`` holds points and observations as arrays, empty if the type has no points. For queries
+    with stored features, ``folder`` and ``name`` are theirs.
     """
 
     folder: KaptureFolder
@@ -63,12 +64,12 @@ class MapKeypoints:
 
     def descriptors(self, image: str) -> NDArray[Any]:
         """Return the stored descriptors (N, D) of a map image."""
-        return np.asarray(self._descriptors.read(image))
+        return np.asarray(self.stored_descriptors.read(image))
 
     def has_descriptors(self, images: Collection[str]) -> bool:
         if self.name not in self.folder.types("descriptors"):
             return False
-        return all(image in self._descriptors for image in images if image in self._keypoints)
+        return all(image in self.stored_descriptors for image in images if image in self._keypoints)
 
     def extractor(self) -> PluginChoice | None:
         """Return the extractor plugin named by the type or its ``keypoints.txt``, or None."""
@@ -79,7 +80,7 @@ class MapKeypoints:
         has_descriptors = self.name in self.folder.types("descriptors")
         if choice is not None and choice.name in _SIFT_OF.values() and has_descriptors:
             # other tools also use the name SIFT; COLMAP's and OpenMVG's descriptors are bytes
-            choice = PluginChoice(name=_SIFT_OF[self._descriptors.config.dtype.kind == "u"])
+            choice = PluginChoice(name=_SIFT_OF[self.stored_descriptors.config.dtype.kind == "u"])
         return choice
 
     def check(self, images: Collection[str]) -> None:
@@ -87,7 +88,7 @@ class MapKeypoints:
             return
         for image in images:
             if image in self._keypoints:
-                check_lengths(self._keypoints, self._descriptors, image)
+                check_lengths(self._keypoints, self.stored_descriptors, image)
 
     # opening a reader lists folders or tar members, so readers are cached
     @cached_property
@@ -95,7 +96,7 @@ class MapKeypoints:
         return self.folder.keypoints(self.name)
 
     @cached_property
-    def _descriptors(self) -> FeatureReader:
+    def stored_descriptors(self) -> FeatureReader:
         return self.folder.descriptors(self.name)
 
 

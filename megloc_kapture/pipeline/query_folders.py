@@ -8,7 +8,7 @@ import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -37,7 +37,6 @@ from megloc_kapture.io.images import (
     write_image,
 )
 from megloc_kapture.io.kapture import (
-    FeatureReader,
     KaptureData,
     KaptureFolder,
     Sensor,
@@ -51,7 +50,7 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_
 from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
-from megloc_kapture.stages.local_features import check_lengths, mask_path
+from megloc_kapture.stages.local_features import mask_path
 from megloc_kapture.stages.scene import depth_of
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
 
@@ -113,24 +112,6 @@ class Queries(ABC):
         """Write the images into a kapture folder, as links if unchanged."""
 
 
-@dataclass(frozen=True)
-class _StoredType:
-    """Stored features of queries; the keypoints follow the convention of ``like``."""
-
-    keypoints: FeatureReader
-    descriptors: FeatureReader
-    like: MapKeypoints
-
-    def __contains__(self, image: str) -> bool:
-        return image in self.keypoints
-
-    def read(self, image: str) -> LocalFeatures:
-        check_lengths(self.keypoints, self.descriptors, image)
-        stored = self.keypoints.read(image)
-        scores = np.zeros(len(stored), np.float32)
-        return LocalFeatures(self.like.to_colmap(stored), scores, self.descriptors.read(image))
-
-
 class KaptureQueries(Queries):
     """Queries of a kapture folder, with the features in it if there are any.
 
@@ -143,7 +124,7 @@ class KaptureQueries(Queries):
         self._folder, self._map = folder, kapture_map
         self.names = folder.read().image_names()
         brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
-        self._local: dict[str, _StoredType] = {}
+        self._local: dict[str, MapKeypoints] = {}
         for stored in kapture_map.stored_types():
             base = base_type(stored)
             plain = plain_name(base)
@@ -151,11 +132,8 @@ class KaptureQueries(Queries):
             if serving and base not in self._local:
                 # a type can replace its guided-pyramid type, and vice versa
                 name = min(serving, key=lambda name: (name != base, name != base_type(name), name))
-                self._local[base] = _StoredType(
-                    folder.keypoints(name),
-                    folder.descriptors(name),
-                    kapture_map.keypoints_of(stored),
-                )
+                of_map = kapture_map.keypoints_of(stored)
+                self._local[base] = replace(of_map, folder=folder, name=name)
         self._data = folder.read() if self._local else with_cameras_of_images(folder)
         self._globals = {
             name: folder.global_features(name)
@@ -229,9 +207,9 @@ class KaptureQueries(Queries):
             for name, vectors in self._globals.items()
         ]
         pairs += [
-            (local.descriptors, local.like.folder.descriptors(local.like.name))
-            for local in self._local.values()
-            if local.like.name in self._map.folder.types("descriptors")
+            (self._local[base_type(name)].stored_descriptors, self._map.folder.descriptors(name))
+            for name in self._map.folder.types("descriptors")
+            if base_type(name) in self._local
         ]
         for reader, other in pairs:
             require(
@@ -296,17 +274,26 @@ class KaptureQueries(Queries):
         return prior_of
 
     def _features(self, name: str) -> dict[str, LocalFeatures]:
-        return {base: reader.read(name) for base, reader in self._local.items() if name in reader}
+        return {
+            base: _stored_features(stored, name)
+            for base, stored in self._local.items()
+            if name in stored
+        }
 
     def _no_features(self) -> dict[str, LocalFeatures]:
+        configs = {base: stored.stored_descriptors.config for base, stored in self._local.items()}
+        none = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
         return {
-            base: LocalFeatures(
-                np.zeros((0, 2), np.float32),
-                np.zeros(0, np.float32),
-                np.zeros((0, local.descriptors.config.dsize), local.descriptors.config.dtype),
-            )
-            for base, local in self._local.items()
+            base: LocalFeatures(*none, np.zeros((0, config.dsize), config.dtype))
+            for base, config in configs.items()
         }
+
+
+def _stored_features(stored: MapKeypoints, image: str) -> LocalFeatures:
+    stored.check([image])
+    keypoints_px = stored.keypoints_px(image)
+    scores = np.zeros(len(keypoints_px), np.float32)
+    return LocalFeatures(keypoints_px, scores, stored.descriptors(image))
 
 
 @dataclass(frozen=True)
