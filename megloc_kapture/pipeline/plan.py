@@ -182,21 +182,10 @@ class Manifest(Options):
     versions: dict[str, str]
 
 
-def fingerprint(
-    stage: str, version: int, options: Mapping[str, Any], inputs: Mapping[str, str]
-) -> str:
-    content = {"stage": stage, "version": version, "options": dict(options), "inputs": dict(inputs)}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=str)
+def fingerprint(stage: str, version: int, options: dict[str, Any], inputs: dict[str, str]) -> str:
+    content = {"stage": stage, "version": version, "options": options, "inputs": inputs}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def output_fingerprint(
-    stage: str, version: int, options: Mapping[str, Any], inputs: Mapping[str, str]
-) -> str:
-    """Return the fingerprint for dependent stages; it ignores the dataset's path and protocol."""
-    others = {name: value for name, value in options.items() if name != PROTOCOL}
-    content = {name: mark for name, mark in inputs.items() if name != ROOT}
-    return fingerprint(stage, version, others, content)
 
 
 def read_manifest(path: Path) -> Manifest | None:
@@ -260,9 +249,10 @@ def run_plan(
         inputs = {name: marks[name] for name in _before(stages, stage)}
         inputs |= _there(stages, stage, workspace) | dict(stage.external()) | stage.code()
         made = workspace.manifest(stage.name)
-        due = _Due(stage, stage.settings(), inputs, made)
-        why = "" if number < start else asked.get(stage.name) or due.why(workspace)
-        marks[stage.name] = due.output
+        planned = _planned(stage, inputs)
+        why = asked.get(stage.name) or _why(stage, planned, made, workspace)
+        why = "" if number < start else why
+        marks[stage.name] = planned.output
         if made is not None and not why:
             marks[stage.name] = made.output
             state: State = "skipped" if number < start else "kept"
@@ -273,53 +263,57 @@ def run_plan(
         else:
             reason = "starting" if why == _NOT_DONE else why
             say(f"{stage.name}, stage {number + 1} of {stop}: {reason}")
-            manifest = _run(due, workspace, work)
+            manifest = _run(stage, planned, made, workspace, work)
             report = StageReport(stage.name, "run", manifest.seconds, manifest.counts, why)
         reports.append(report)
         say(describe(report))
     return reports
 
 
-@dataclass(frozen=True)
-class _Due:
-    stage: Stage
-    settings: Mapping[str, Any]
-    inputs: Mapping[str, str]
-    made: Manifest | None
+def _planned(stage: Stage, inputs: dict[str, str]) -> Manifest:
+    """Return the manifest that a run of the stage would have, without results."""
+    settings = json.loads(json.dumps(stage.settings(), default=str))  # converts tuples to lists
+    # stages that read the outputs do not depend on the dataset's path and protocol
+    options = {name: value for name, value in settings.items() if name != PROTOCOL}
+    content = {name: mark for name, mark in inputs.items() if name != ROOT}
+    return Manifest(
+        stage=stage.name,
+        version=stage.version,
+        options=settings,
+        inputs=inputs,
+        fingerprint=fingerprint(stage.name, stage.version, settings, inputs),
+        output=fingerprint(stage.name, stage.version, options, content),
+        outputs=(),
+        seconds=0.0,
+        started="",
+        versions={},
+    )
 
-    @property
-    def mark(self) -> str:
-        return fingerprint(self.stage.name, self.stage.version, self.settings, self.inputs)
 
-    @property
-    def output(self) -> str:
-        return output_fingerprint(self.stage.name, self.stage.version, self.settings, self.inputs)
+def _former_outputs(stage: Stage, made: Manifest | None) -> list[str]:
+    return [] if made is None else sorted(set(made.outputs) - set(stage.writes))
 
-    def former_outputs(self) -> list[str]:
-        before = () if self.made is None else self.made.outputs
-        return sorted(set(before) - set(self.stage.writes))
 
-    def why(self, workspace: Workspace) -> str:
-        made = self.made
-        if made is None:
-            return _NOT_DONE
-        gone = [output for output in made.outputs if not workspace.path(output).exists()]
-        if gone:
-            return f"{gone[0]} is missing"
-        if before := self.former_outputs():
-            return f"{before[0]} is no longer written"
-        if made.fingerprint == self.mark:
-            return ""
-        if made.version != self.stage.version:
-            return "a newer version of the stage"
-        changed = _differences(made.inputs, self.inputs)
-        # report a changed option rather than changed plugin code
-        read = [name for name in changed if not name.startswith(CODE_OF)]
-        settings = json.loads(json.dumps(self.settings))  # converts tuples to lists
-        options = _differences(made.options, settings)
-        if options and not read:
-            return f"options changed: {', '.join(options[:3])}"
-        return f"{(read or changed)[0]} changed"
+def _why(stage: Stage, planned: Manifest, made: Manifest | None, workspace: Workspace) -> str:
+    """Return the reason to run a stage, or "" if its results are up to date."""
+    if made is None:
+        return _NOT_DONE
+    gone = [output for output in made.outputs if not workspace.path(output).exists()]
+    if gone:
+        return f"{gone[0]} is missing"
+    if before := _former_outputs(stage, made):
+        return f"{before[0]} is no longer written"
+    if made.fingerprint == planned.fingerprint:
+        return ""
+    if made.version != planned.version:
+        return "a newer version of the stage"
+    changed = _differences(made.inputs, planned.inputs)
+    # report a changed option rather than changed plugin code
+    read = [name for name in changed if not name.startswith(CODE_OF)]
+    options = _differences(made.options, planned.options)
+    if options and not read:
+        return f"options changed: {', '.join(options[:3])}"
+    return f"{(read or changed)[0]} changed"
 
 
 def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
@@ -389,11 +383,12 @@ def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
     return [] if old == new else [prefix]
 
 
-def _run(due: _Due, workspace: Workspace, work: Work) -> Manifest:
-    stage = due.stage
+def _run(
+    stage: Stage, planned: Manifest, made: Manifest | None, workspace: Workspace, work: Work
+) -> Manifest:
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = time.perf_counter()
-    with workspace.staging(stage.name, due.mark, resumes=stage.resumes) as folder:
+    with workspace.staging(stage.name, planned.fingerprint, resumes=stage.resumes) as folder:
         resumed = replace(work, resume=stage.resumes, placement=stage.placement)
         counts = dict(stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder)))
         clear_temporary(folder)
@@ -402,20 +397,15 @@ def _run(due: _Due, workspace: Workspace, work: Work) -> Manifest:
         _take_over(stage, workspace)
         written = tuple(o for o in stage.writes if (folder / o).exists())
         workspace.publish(folder, tuple(stage.writes))
-        workspace.remove(due.former_outputs())
-    manifest = Manifest(
-        stage=stage.name,
-        version=stage.version,
-        options=dict(due.settings),
-        inputs=dict(due.inputs),
-        fingerprint=due.mark,
-        output=due.output,
-        outputs=written,
-        counts=counts,
-        seconds=round(time.perf_counter() - clock, 3),
-        started=started,
-        versions=package_versions(),
-    )
+        workspace.remove(_former_outputs(stage, made))
+    results = {
+        "outputs": written,
+        "counts": counts,
+        "seconds": round(time.perf_counter() - clock, 3),
+        "started": started,
+        "versions": package_versions(),
+    }
+    manifest = planned.model_copy(update=results)
     write_json_model(workspace.manifest_path(stage.name), manifest)
     return manifest
 
