@@ -358,11 +358,6 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
 
 
 def _stamp(source: ColmapFolders) -> str:
-    lines = [f"import {_VERSION}", f"images {source.images and os.path.realpath(source.images)}"]
-    for file in source.files():
-        try:
-            status = file.stat()
-        except OSError as error:
-            raise DataError(f"cannot read: {error.strerror}", path=file) from error
-        lines.append(f"{os.path.realpath(file)} {status.st_size} {status.st_mtime_ns}")
-    return "\n".join(lines)
+    files = files_fingerprint(Path("/"), [file.resolve() for file in source.files()])
+    images = source.images and source.images.resolve()
+    return f"import {_VERSION}\nimages {images}\nfiles {files}"

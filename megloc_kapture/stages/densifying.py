@@ -120,18 +120,16 @@ def densify_map(
     output: Path,
     options: DensifyOptions,
     *,
-    estimator: DepthEstimator | None = None,
     restrictions: Restrictions = UNRESTRICTED,
     link_features: bool = False,
     work: Work = HERE,
 ) -> dict[str, float]:
     """Write a map with stereo depth of its images; return counts for the log.
 
-    Images are only compared within a frame, location and condition. ``estimator`` overrides the one
-    in the options. ``link_features`` is as in
+    Images are only compared within a frame, location and condition. ``link_features`` is as in
     :func:`~megloc_kapture.stages.map_refinement.refine_map`.
     """
-    estimator = estimator or options.make_estimator(work.placement)
+    estimator = options.make_estimator(work.placement)
     data = source.read()
     _check(source, data)
     fit = fitted_to_poses(source, options.max_size_px)
