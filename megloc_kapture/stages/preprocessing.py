@@ -334,7 +334,6 @@ def preprocess_images(
     or pixels outside the original. ``sensors/classes`` has the segmenter's labels. ``sequences``
     are more folders in which to find static regions: for queries, the map.
     """
-    output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
         raise OutputError(f"{output}: is inside the input kapture folder, which is not modified")
     classes = options.masks.make_classes(work.placement, segmenter)
@@ -352,7 +351,6 @@ def preprocess_images(
         if not any(mask.is_for(sensor, image) for image, sensor in sensor_of.items()):
             remarks.append(f"a fixed mask matches no image: {mask.camera}")
 
-    _unlink_folders(output)
     write_sensors(output, _with_cameras(data, plans))
     linked = _link_records(folder, output, plans)
     if classes is not None:
@@ -419,14 +417,6 @@ def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureD
             name = data.sensors[sensor_id].name
             sensors[sensor_id] = Sensor.from_camera(plan.processed, name=name)
     return replace(data, sensors=sensors)
-
-
-def _unlink_folders(output: Path) -> None:
-    """Remove links to folders, so that user data behind the links is not overwritten."""
-    for name in ("records_data", "masks", CLASSES):
-        path = output / "sensors" / name
-        if path.is_symlink():
-            path.unlink()
 
 
 def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:

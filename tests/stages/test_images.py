@@ -133,9 +133,8 @@ def test_by_default_images_are_linked_and_originals_stay(
     share = pytest.approx(0.25 / 6)
     expected = {"images": 6, "images_changed": 0, "images_masked": 1}
     assert counts == {**expected, "masked_all": share, "masked_own": share}
-    # a second run replaces the link to the originals by images
-    new, _ = run(street, tmp_path / "new", max_size_px=160)
-    assert image_size(new.image_path("front/0.png")) == (160, 96)
+    smaller, _ = run(street, tmp_path / "smaller", max_size_px=160)
+    assert image_size(smaller.image_path("front/0.png")) == (160, 96)
     for place in (street.root, street.root / "sensors"):
         with pytest.raises(OutputError, match="is inside the input kapture folder"):
             run(street, place)
