@@ -81,7 +81,7 @@ class Map:
 
     def __repr__(self) -> str:
         root, images = self.kapture_map.folder.root, self.kapture_map.images
-        types = ", ".join(self.kapture_map.stored_types())
+        types = ", ".join(self.kapture_map.folder.types("keypoints"))
         return f"Map({str(root)!r}: {len(images)} images, features {types})"
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:

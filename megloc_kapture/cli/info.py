@@ -197,7 +197,7 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
     types = local_types_of(opened, options)
     retrieval = MapMatching(opened, options, types, Preprocessor(options))
     line(console, "retrieval", retrieval.describe_candidates(()))
-    if brought := opened.global_types():
+    if brought := opened.global_types:
         text = retrieval.describe_candidates(brought)
         line(console, "", f"if queries have {', '.join(brought)}: {text}")
 

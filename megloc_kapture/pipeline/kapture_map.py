@@ -172,10 +172,6 @@ class KaptureMap:
         """Unit of points and poses: ``m``, or ``units`` if the scale is unknown."""
         return unit_of(self.folder.root)
 
-    def stored_types(self) -> list[str]:
-        """Keypoints types with or without points."""
-        return self.folder.types("keypoints")
-
     @cached_property
     def poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of the map images that have keypoints."""
@@ -205,15 +201,11 @@ class KaptureMap:
         except DataError:
             return False
 
-    def global_types(self) -> list[str]:
-        """Return the global-feature types that all map images have."""
-        return list(self._global_types)
-
     def check(self) -> None:
         """Check the sizes of all feature files used for localization, without reading the files."""
         for keypoints in self.keypoints.values():
             keypoints.check(self.images)
-        for name in self._global_types:
+        for name in self.global_types:
             vectors = self.folder.global_features(name)
             for image in self.images:
                 vectors.length(image)
@@ -236,13 +228,14 @@ class KaptureMap:
         return None
 
     @cached_property
-    def _global_types(self) -> tuple[str, ...]:
+    def global_types(self) -> list[str]:
+        """Global-feature types that all map images have."""
         readers = {t: self.folder.global_features(t) for t in self.folder.types("global_features")}
-        return tuple(
+        return [
             name
             for name, reader in readers.items()
             if all(image in reader for image in self.images)
-        )
+        ]
 
 
 def restrictions_beside(root: Path) -> Restrictions:

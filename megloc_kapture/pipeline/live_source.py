@@ -210,7 +210,7 @@ def local_types_of(kapture_map: KaptureMap, options: PipelineOptions) -> list[Lo
     """
     choices = options.local_features
     by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}
-    for stored in kapture_map.stored_types():
+    for stored in kapture_map.folder.types("keypoints"):
         named = _rank(stored, choices) < len(choices)
         if named and base_type(stored) not in by_base:
             by_base[base_type(stored)] = kapture_map.keypoints_of(stored)
@@ -218,7 +218,7 @@ def local_types_of(kapture_map: KaptureMap, options: PipelineOptions) -> list[Lo
     for base in sorted(by_base, key=lambda name: (_rank(name, choices), name)):
         points = by_base[base]
         first, rank = points, _rank(base, choices)
-        if options.uses_pyramid() and base in kapture_map.stored_types():
+        if options.uses_pyramid() and base in kapture_map.folder.types("keypoints"):
             first = kapture_map.keypoints_of(base)
         choice = choices[rank] if rank < len(choices) else None
         types.append(LocalType(kapture_map, points, first, choice, options))
@@ -419,7 +419,7 @@ class MapMatching:
         return f"the {top_k} of {count} map images that are most similar by {how}"
 
     def _compared(self, brought: Collection[str]) -> Sequence[_GlobalType]:
-        shared = [name for name in self._map.global_types() if name in brought]
+        shared = [name for name in self._map.global_types if name in brought]
         with self._lock:
             if not shared:
                 usable = [kind for kind in self._wanted if kind.stored or kind.is_vlad]
@@ -439,9 +439,9 @@ class MapMatching:
         try:
             extractor = choice.make(self.options.placement)
         except MissingWeightsError:  # raised again when the type is used
-            stored = any(name.startswith(choice.name) for name in self._map.global_types())
+            stored = any(name.startswith(choice.name) for name in self._map.global_types)
             return _GlobalType(choice.name, choice.weight, stored, choice)
-        stored = extractor.name in self._map.global_types()
+        stored = extractor.name in self._map.global_types
         return _GlobalType(extractor.name, choice.weight, stored, choice, extractor)
 
     def _vlad_name(self, choice: GlobalFeaturesChoice) -> str:
@@ -451,14 +451,14 @@ class MapMatching:
             if local_type in (None, settings.local_type):
                 return name
         name = vlad_type(local_type or base_type(self.types[0].name))
-        return name if name not in self._map.global_types() else f"{name}, newly trained"
+        return name if name not in self._map.global_types else f"{name}, newly trained"
 
     @cached_property
     def _stored_vocabularies(self) -> dict[str, tuple[Vocabulary, VladSettings]]:
         folder = self._map.folder
         known = {base_type(local.name) for local in self.types}
         vocabularies: dict[str, tuple[Vocabulary, VladSettings]] = {}
-        for name in self._map.global_types():
+        for name in self._map.global_types:
             places = [folder.root / "reconstruction" / "global_features" / name]
             places += [
                 d / "global_features" / name / "global_features" for d in folder.features_dirs

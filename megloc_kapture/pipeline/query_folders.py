@@ -125,7 +125,7 @@ class KaptureQueries(Queries):
         self.names = folder.read().image_names()
         brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
         self._local: dict[str, MapKeypoints] = {}
-        for stored in kapture_map.stored_types():
+        for stored in kapture_map.folder.types("keypoints"):
             base = base_type(stored)
             plain = plain_name(base)
             serving = [name for name in brought if plain_name(base_type(name)) == plain]
@@ -137,7 +137,7 @@ class KaptureQueries(Queries):
         self._data = folder.read() if self._local else with_cameras_of_images(folder)
         self._globals = {
             name: folder.global_features(name)
-            for name in kapture_map.global_types()
+            for name in kapture_map.global_types
             if name in folder.types("global_features")
         }
 
