@@ -238,5 +238,5 @@ class MakePoints(PipelineStage):
         mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
         if not options.triangulates():
             return lift_map(mapping, options.local_types(), out, work=work)
-        types, threads = options.point_types(), work.num_threads
+        types, threads = options.matched_types(), work.num_threads
         return triangulate_map(mapping, types, out, options.triangulation, num_threads=threads)

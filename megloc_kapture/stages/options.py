@@ -128,15 +128,8 @@ class PipelineOptions(Options):
     def pairs_by_points(self) -> bool:
         return self.triangulates() and self.mapping_pairs.needs_points()
 
-    def point_types(self) -> list[str]:
-        """Return keypoints types with map points, possibly pyramid types."""
-        types = self.local_types()
-        if self.uses_pyramid() and self.triangulates():
-            return [pyramid_type(local_type) for local_type in types]
-        return types
-
-    def query_types(self) -> list[str]:
-        """Return keypoints types of the query matches, in the order of :meth:`local_types`."""
+    def matched_types(self) -> list[str]:
+        """Return keypoints types of the final matches, in the order of :meth:`local_types`."""
         types = self.local_types()
         return [pyramid_type(name) for name in types] if self.uses_pyramid() else types
 

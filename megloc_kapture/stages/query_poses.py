@@ -371,7 +371,7 @@ class LocalizeQueries(PipelineStage):
             work.folder(MAP),
             query,
             pairs,
-            self.options.query_types(),
+            self.options.matched_types(),
             options,
             restrictions=Restrictions.read(tables),
             work=work,
