@@ -76,10 +76,9 @@ def localized(
         )
         for seed in seeds
     }
-    folder = KaptureQueries(KaptureFolder(Path(folders[1])), kapture_map)
-    queries = [folder.query(name) for name in folder.names]
-    for original in queries[::every]:
-        query = with_features(original, localizers[seeds[0]])
+    queries = KaptureQueries(KaptureFolder(Path(folders[1])), kapture_map)
+    for image in queries.names[::every]:
+        query = with_features(queries.query(image), localizers[seeds[0]])
         MATCHES.clear()
         pose = truth.cam_from_world(query.name)
         for seed, factor in ((seed, factor) for seed in seeds for factor in factors):

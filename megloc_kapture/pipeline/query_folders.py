@@ -74,8 +74,7 @@ class Queries(ABC):
         self.unreadable: dict[str, str] = {}
         self.faults: dict[str, str] = {}
 
-    @abstractmethod
-    def check(self) -> None:
+    def check(self) -> None:  # noqa: B027  # the constructor of photographs checks them
         """Check everything that can be checked without reading features or pixels."""
 
     def lacking(self, local_type: str) -> str | None:
@@ -371,9 +370,6 @@ class Photographs(Queries):
             text = f"{len(self.without_row)} images are not in the list of cameras"
             lines.append(f"{text}, their cameras are estimated: {_first(self.without_row)}")
         return lines
-
-    def check(self) -> None:
-        """Do nothing: the constructor has made all checks that need no pixels."""
 
     def query(self, name: str) -> Query:
         image = self._images[name]
