@@ -15,7 +15,6 @@ from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.report.reports import RECALL_JSON, write_report
-from megloc_kapture.evaluation.results import context_of
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_protocol
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -362,22 +361,15 @@ class Evaluate(_RunStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         localized, truth, tables = map(work.path, (LOCALIZED, QUERY_GT, SIDE_TABLES))
-        map_poses = work.folder(MAPPING).read().poses()
         provenance = self.settings() | {"versions": package_versions()}
         del provenance[PROTOCOL]  # the report shows the protocol as text
-        output = work.out / EVALUATION
-        context, label = context_of(localized), self._run.label
+        output, label = work.out / EVALUATION, self._run.label
         if not truth.is_dir():
             results = results_without_truth([localized], benchmark_of(tables), labels=[label])
-            results = replace(
-                results, evaluations=(replace(results.evaluations[0], context=context),)
-            )
-            write_report(output, results, map_poses=map_poses, provenance=provenance)
+            write_report(output, results, provenance=provenance)
             return {"queries_with_truth": 0}
-        mapping = work.path(MAPPING)
-        evaluation = evaluate(localized, truth, side_tables=tables, label=label, mapping=mapping)
-        evaluation = replace(evaluation, context=context)
-        write_report(output, evaluation, map_poses=map_poses, provenance=provenance)
+        evaluation = evaluate(localized, truth, side_tables=tables, label=label)
+        write_report(output, evaluation, provenance=provenance)
         row = evaluation.row()
         recall = {
             f"recall within {at.threshold} percent".replace(",", " and"): round(100 * at.recall, 2)

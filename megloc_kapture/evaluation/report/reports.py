@@ -53,21 +53,17 @@ def write_report(
     folder: Path | str,
     reported: Reported,
     *,
-    map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> dict[str, Path]:
     """Write the files of a report and return name -> path.
 
     The files are recall.json and recall.txt (without truth agreement.json and agreement.txt),
-    per_query.csv, report.html, and view.html for a single result. ``map_poses`` are by default
-    those of the first result with a map. ``provenance`` is JSON data, shown at the end of the page;
-    its ``steps``, a table of the stages, are near the top.
+    per_query.csv, report.html, and view.html for a single result. ``provenance`` is JSON data,
+    shown at the end of the page; its ``steps``, a table of the stages, are near the top.
     """
     name = "agreement" if isinstance(reported, WithoutTruth) else "recall"
     view = _view(reported)
-    page = render_report(
-        reported, map_poses=map_poses, provenance=provenance, has_view=view is not None
-    )
+    page = render_report(reported, provenance=provenance, has_view=view is not None)
     texts = {f"{name}.txt": report_text(reported), REPORT_HTML: page}
     if view is not None:
         texts[VIEW_HTML] = view
@@ -247,14 +243,12 @@ class Section:
 def render_report(
     reported: Reported,
     *,
-    map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
     has_view: bool = False,
 ) -> str:
     """Render the page; it is self-contained and deterministic."""
     evaluations = reported.evaluations
-    if map_poses is None:
-        map_poses = first_map_poses(evaluation.context for evaluation in evaluations)
+    map_poses = first_map_poses(evaluation.context for evaluation in evaluations)
     sections = [_summary(reported)]
     if not isinstance(reported, WithoutTruth):
         sections.append(_error_curves(evaluations))

@@ -74,8 +74,8 @@ def test_names_are_escaped_and_the_steps_of_the_paper_come_first(world: Any) -> 
 
 def test_files(world: Any, tmp_path: Path) -> None:
     evaluation = evaluation_of(world)
-    options = {"map_poses": world.mapped, "provenance": {"preset": "classic"}}
-    paths = write_report(tmp_path / "evaluation", evaluation, **options)
+    provenance = {"preset": "classic"}
+    paths = write_report(tmp_path / "evaluation", evaluation, provenance=provenance)
 
     assert "Recall" in visible_text(paths["report.html"].read_text())
     with pytest.raises(OutputError, match="recall"):
