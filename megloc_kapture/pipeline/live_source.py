@@ -44,7 +44,6 @@ from megloc_kapture.stages.matches import (
     VerifiedMatches,
     best_pairs,
     match_all,
-    verification_of,
     verified,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
@@ -136,14 +135,14 @@ class LocalType:
         self, query: Features, images: Sequence[str], matcher: Matcher | None = None
     ) -> list[VerifiedMatches]:
         matches = dict.fromkeys(images, _NO_MATCHES)
-        verify = verification_of(self._options.verify_queries())
+        verification = self._options.verify_queries()
         # batches limit the features in memory
         for names in batched((image for image in images if image in self.first), BATCH):
             others = [self._map_features(self.first, name) for name in names]
             labels = [f"pair with {name}" for name in names]
             pairs = match_all(matcher or self.matcher, query, others, labels)
             for name, other, pair in zip(names, others, pairs, strict=True):
-                matches[name] = verified(query, other, pair, verify)
+                matches[name] = verified(query, other, pair, verification)
         return [matches[image] for image in images]
 
     def match_again(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from itertools import combinations, groupby
@@ -116,10 +116,6 @@ class Features(ImageFeatures):
     def slopes(self) -> NDArray[np.float64]:
         """``ray_slopes`` of the keypoints (N, 2, 2)."""
         return ray_slopes(self.camera, self.keypoints_px[:, :2], self.rays)
-
-
-Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
-"""Selects the correct matches, bool (K,), among those of two images, (K, 2), best first."""
 
 
 _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
@@ -269,7 +265,7 @@ def _evidence(
         poses = data.cam_from_world(image), data.cam_from_world(other)
         if poses[0] is None or poses[1] is None:
             continue
-        rows, _, number = verified(a, b, pair, verification_of(options))
+        rows, _, number = verified(a, b, pair, options)
         i, j = rows.T
         pixels_a, pixels_b = a.keypoints_px[i, :2], b.keypoints_px[j, :2]
         if agree_by_chance(pixels_a, a.camera, pixels_b, b.camera, number, options):
@@ -321,7 +317,7 @@ def _verify(
 
     a, *read = _read(folders, local_type, (image, others))
     return [
-        verified(a, b, pair, verification_of(verification, partial(relative, other)))
+        verified(a, b, pair, verification, relative(other))
         for other, b, pair in zip(others, read, matched, strict=True)
     ]
 
@@ -354,35 +350,40 @@ def match_all(
     return pairs
 
 
-def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> VerifiedMatches:
-    matches, scores = pair
-    good = verify_best_first(partial(verify, a, b), matches, scores)
-    return VerifiedMatches(matches[good], scores[good], len(matches))
-
-
-def verification_of(
-    options: Verification, b_from_a: Callable[[], RigidTransform | None] = lambda: None
-) -> Verify:
-    """Return a function that selects the correct matches.
+def verified(
+    a: Features,
+    b: Features,
+    pair: _PairMatches,
+    verification: Verification,
+    b_from_a: RigidTransform | None = None,
+) -> VerifiedMatches:
+    """Return the correct matches of a pair.
 
     Verification by known poses rejects every match if the relative pose is unknown.
     """
+    matches, scores = pair
+    good = verify_best_first(partial(_are_correct, a, b, verification, b_from_a), matches, scores)
+    return VerifiedMatches(matches[good], scores[good], len(matches))
 
-    def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        rows_a, rows_b = matches.T
-        if options is None:
-            return np.ones(len(matches), dtype=bool)
-        if isinstance(options, TwoViewOptions):
-            points_px = a.keypoints_px[rows_a, :2], b.keypoints_px[rows_b, :2]
-            return verify_two_view(points_px[0], a.camera, points_px[1], b.camera, options)
-        pose = b_from_a()
-        if pose is None:
-            return np.zeros(len(matches), dtype=bool)
-        return verify_with_poses(
-            a.rays[rows_a], a.slopes[rows_a], b.rays[rows_b], b.slopes[rows_b], pose, options
-        )
 
-    return verify
+def _are_correct(
+    a: Features,
+    b: Features,
+    verification: Verification,
+    b_from_a: RigidTransform | None,
+    matches: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Return the mask (K,) of the correct matches (K, 2), which are best first."""
+    rows_a, rows_b = matches.T
+    if verification is None:
+        return np.ones(len(matches), dtype=bool)
+    if isinstance(verification, TwoViewOptions):
+        points_px = a.keypoints_px[rows_a, :2], b.keypoints_px[rows_b, :2]
+        return verify_two_view(points_px[0], a.camera, points_px[1], b.camera, verification)
+    if b_from_a is None:
+        return np.zeros(len(matches), dtype=bool)
+    rays = a.rays[rows_a], a.slopes[rows_a], b.rays[rows_b], b.slopes[rows_b]
+    return verify_with_poses(*rays, b_from_a, verification)
 
 
 @lru_cache(maxsize=8)
