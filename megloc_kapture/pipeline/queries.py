@@ -120,25 +120,24 @@ class Preprocessor:
         return self._options.preprocessing.masks.make_classes(self._options.placement)
 
 
-class QueryImage:
+class QueryImage(ProcessedFrame):
     """Preprocessed pixels, mask and depth of a query, computed lazily, with the matching camera."""
 
     def __init__(self, query: Query, plan: FramePlan, preprocessor: Preprocessor) -> None:
-        self.query, self._preprocessor = query, preprocessor
-        self.camera: Camera = plan.processed
-        self._plan = plan
-        self._frame = ProcessedFrame(
+        super().__init__(
             query.name, plan, query.read_image, self._own_mask, lambda: preprocessor.classes
         )
+        self.query, self._preprocessor = query, preprocessor
+        self.camera: Camera = plan.processed
 
     def in_original(self, pose: Pose) -> Pose:
         """Convert a pose's camera and inlier pixels to the original image."""
         if pose.camera is not None:
-            camera = self._plan.original_of(pose.camera)
+            camera = self.plan.original_of(pose.camera)
             remark = estimate_remark(camera, self.query.camera)
             pose = replace(pose, camera=camera, remarks=(*pose.remarks, remark))
-        if pose.inlier_points_px is not None and self._plan.changes_pixels:
-            cameras = self._plan.processed, self._plan.original
+        if pose.inlier_points_px is not None and self.plan.changes_pixels:
+            cameras = self.plan.processed, self.plan.original
             carried = carry_points(*cameras, pose.inlier_points_px)
             pose = replace(pose, inlier_points_px=carried)
         return pose
@@ -146,16 +145,6 @@ class QueryImage:
     def _own_mask(self) -> dict[str, NDArray[np.bool_]]:
         mask = self.query.read_mask()
         return {} if mask is None else {"own": mask}
-
-    @property
-    def pixels(self) -> NDArray[np.uint8]:
-        """Image, uint8 (H, W, 3) RGB."""
-        return self._frame.stored
-
-    @cached_property
-    def mask(self) -> NDArray[np.bool_] | None:
-        """Combined mask bool (H, W), True = use; None means no mask."""
-        return self._frame.mask
 
     @property
     def depth(self) -> DepthView | None:

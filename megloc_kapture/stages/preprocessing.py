@@ -232,31 +232,31 @@ class ProcessedFrame:
         self._read, self._original_masks, self._classes = read, masks, classes
 
     @cached_property
-    def pixels(self) -> NDArray[np.uint8]:
-        """Return the new image, uint8 (H, W, 3) RGB."""
+    def _exact(self) -> NDArray[np.uint8]:
+        """Return the new image, uint8 (H, W, 3) RGB, before it is written."""
         image = self._read()
         return processed_image(image, self.plan) if self.plan.changes_pixels else image
 
     @property
     def written(self) -> NDArray[np.uint8]:
         """Return the pixels to write; a grey image has only one channel."""
-        red = self.pixels[..., 0]
-        grey = all(np.array_equal(red, self.pixels[..., channel]) for channel in (1, 2))
-        return np.ascontiguousarray(red) if grey else self.pixels
+        red = self._exact[..., 0]
+        grey = all(np.array_equal(red, self._exact[..., channel]) for channel in (1, 2))
+        return np.ascontiguousarray(red) if grey else self._exact
 
     @cached_property
-    def stored(self) -> NDArray[np.uint8]:
+    def pixels(self) -> NDArray[np.uint8]:
         """Return the new image as it reads back from its file, with JPEG loss."""
         if not self.plan.changes_pixels:
-            return self.pixels
+            return self._exact
         read = image_as_read_back(self.written, self.name, jpeg_quality=JPEG_QUALITY)
-        return read if read.ndim == 3 else self.pixels
+        return read if read.ndim == 3 else self._exact
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
         """Return the class of each pixel, uint8 (H, W), if there is a segmenter."""
         classes = self._classes()
-        return None if classes is None else classes.labels(self.pixels, self.name)
+        return None if classes is None else classes.labels(self._exact, self.name)
 
     @cached_property
     def masks(self) -> dict[str, Mask]:
@@ -271,7 +271,7 @@ class ProcessedFrame:
             masks["unseen"] = reached
         return masks
 
-    @property
+    @cached_property
     def mask(self) -> Mask | None:
         """Return the combined mask; None means no mask."""
         return np.logical_and.reduce(list(self.masks.values())) if self.masks else None
