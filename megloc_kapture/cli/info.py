@@ -20,6 +20,7 @@ from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.folder import ARRAY_KINDS
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
@@ -121,9 +122,9 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
         # a depth map belongs to an image if a rig links their sensors
         use = "" if joined else ": ignored, as no rig links their sensor to a camera"
         line(console, "depth maps", f"{len(data.records_depth)}, of {joined} images{use}")
-    for kind in ("keypoints", "descriptors", "global_features"):
+    for kind in ARRAY_KINDS:
         for name in folder.types(kind):
-            reader = getattr(folder, kind)(name)
+            reader = folder.features(kind, name)
             stored = f"{reader.config.dtype.name} x {reader.config.dsize}"
             text = f"{name}: {len(reader.names)} images, {stored}"
             line(console, kind.replace("_", " "), text)

@@ -6,7 +6,7 @@ are transferred to extracted keypoints at the same positions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -18,7 +18,6 @@ from scipy.spatial import cKDTree
 from megloc_kapture.errors import require
 from megloc_kapture.io.files import hard_link, link_images
 from megloc_kapture.io.kapture import (
-    FeatureReader,
     FeatureWriter,
     KaptureFolder,
     Observations,
@@ -27,6 +26,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
+from megloc_kapture.io.kapture.folder import ARRAY_KINDS
 
 # detector implementations differ by some tenths of a pixel
 _MAX_SHIFT_PX = 1.0
@@ -147,11 +147,6 @@ def rows_at_their_places(
     return np.repeat(close, lengths), np.concatenate([none, *near]).astype(np.int64)
 
 
-_READ: dict[ArrayKind, Callable[[KaptureFolder, str], FeatureReader]] = {
-    "keypoints": KaptureFolder.keypoints,
-    "descriptors": KaptureFolder.descriptors,
-    "global_features": KaptureFolder.global_features,
-}
 VOCABULARY_FILE, SETTINGS_FILE = "vocabulary.npy", "vlad.json"
 MEAN_FILE, PROJECTION_FILE = "whitening_mean.npy", "whitening_projection.npy"
 _VLAD_FILES = (VOCABULARY_FILE, SETTINGS_FILE, MEAN_FILE, PROJECTION_FILE)
@@ -170,7 +165,7 @@ def copy_features(
     copied, unless ``link_own`` is set. ``local_types`` does not restrict global features.
     """
     wanted = None if local_types is None else set(local_types)
-    for kind in _READ:
+    for kind in ARRAY_KINDS:
         for name in source.types(kind):
             if kind == "global_features" or wanted is None or name in wanted:
                 _copy_type(source, output, kind, name, link_own=link_own)
@@ -180,7 +175,7 @@ def _copy_type(
     source: KaptureFolder, output: Path, kind: ArrayKind, type_name: str, *, link_own: bool
 ) -> None:
     copies = output / "reconstruction" / kind / type_name
-    reader, reconstruction = _READ[kind](source, type_name), source.root / "reconstruction"
+    reader, reconstruction = source.features(kind, type_name), source.root / "reconstruction"
     with FeatureWriter(output, kind, type_name, reader.config) as writer:
         for image in filter(reader.__contains__, source.read().image_names()):
             file = Path(reader.where(image))

@@ -27,7 +27,7 @@ from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.io.kapture.points import Observations, read_observations, read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 
-_ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
+ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
 
 
 class KaptureFolder:
@@ -59,9 +59,9 @@ class KaptureFolder:
         for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
             if _same_content(self.image_path(image), other.image_path(image)):
                 continue
-            for kind in _ARRAY_KINDS:
+            for kind in ARRAY_KINDS:
                 for type_name in sorted(set(self.types(kind)) & set(other.types(kind))):
-                    mine, theirs = (folder._features(kind, type_name) for folder in (self, other))
+                    mine, theirs = (folder.features(kind, type_name) for folder in (self, other))
                     if image in mine and image in theirs and _same_array(mine, theirs, image):
                         raise DataError(
                             f"{image} is another image in {self.root} than in {other.root}, and "
@@ -89,14 +89,17 @@ class KaptureFolder:
             types.update(list_types(folder, kind, orphan=True))
         return sorted(types)
 
+    def features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
+        return FeatureReader(kind, type_name, self._folders(kind, type_name))
+
     def keypoints(self, type_name: str) -> FeatureReader:
-        return self._features("keypoints", type_name)
+        return self.features("keypoints", type_name)
 
     def descriptors(self, type_name: str) -> FeatureReader:
-        return self._features("descriptors", type_name)
+        return self.features("descriptors", type_name)
 
     def global_features(self, type_name: str) -> FeatureReader:
-        return self._features("global_features", type_name)
+        return self.features("global_features", type_name)
 
     def matches(self, type_name: str) -> MatchesReader:
         return MatchesReader(type_name, self._folders("matches", type_name))
@@ -133,8 +136,8 @@ class KaptureFolder:
         """Cross-check sensors, features and points and, if ``deep``, also images and matches."""
         self.read()
         readers = {
-            kind: {name: self._features(kind, name) for name in self.types(kind)}
-            for kind in _ARRAY_KINDS
+            kind: {name: self.features(kind, name) for name in self.types(kind)}
+            for kind in ARRAY_KINDS
         }
         for of_kind in readers.values():
             for reader in of_kind.values():
@@ -154,9 +157,6 @@ class KaptureFolder:
         if deep:
             for image in self.read().image_names():
                 read_image_rgb(self.image_path(image))
-
-    def _features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
-        return FeatureReader(kind, type_name, self._folders(kind, type_name))
 
     def _folders(self, kind: FeatureKind, type_name: str) -> list[Path]:
         candidates = [(self.root, False), *((folder, True) for folder in self.features_dirs)]
