@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import starmap
 from pathlib import Path
 
 import tyro
@@ -41,7 +40,7 @@ from megloc_kapture.plugins import POSE_REFINERS
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
 from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.stage import LOCALIZED, MAP, count_text
+from megloc_kapture.stages.stage import LOCALIZED, MAP, counts_text
 from megloc_kapture.stages.stereo_depth import fuse_depth
 
 
@@ -153,7 +152,7 @@ class Densify(Reading, Choosing, Working):
             counts = densify_map(
                 source, out, options, restrictions=restrictions_beside(source.root), work=work
             )
-            console.say(", ".join(starmap(count_text, counts.items())))
+            console.say(counts_text(counts))
             if self.fuse is not None:
                 agreement = fitted_to_poses(source, options.max_size_px).agreement
                 fused = fuse_depth(KaptureFolder(out), self.fuse, agreement, work=work)
@@ -196,8 +195,7 @@ class RefinePoses(Choosing, Working):
                 restrictions=restrictions_beside(self.query),
                 work=work,
             )
-        text = ", ".join(starmap(count_text, counts.items()))
-        console.result(f"{text}; status.csv and refinement.csv in {self.output}")
+        console.result(f"{counts_text(counts)}; status.csv and refinement.csv in {self.output}")
         if (table := self.output / CONSISTENCY_FILE).is_file():
             for row in read_consistency(table):
                 console.result(consistency_sentence(row))

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, make_dataclass
 from inspect import getdoc
-from itertools import starmap
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -53,7 +52,7 @@ from megloc_kapture.stages.matches import check_given_poses, match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
 from megloc_kapture.stages.reranking import RerankingOptions, reranked
-from megloc_kapture.stages.stage import count_text
+from megloc_kapture.stages.stage import counts_text
 
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
 
@@ -101,8 +100,7 @@ class ExtractLocal(Choosing, Working):
                 counts = extract_local_features(
                     folders, extractor, out, mask_margin_px=options.mask_margin_px, work=work
                 )
-                text = ", ".join(starmap(count_text, counts.items()))
-                console.say(f"{extractor.name}: {text}")
+                console.say(f"{extractor.name}: {counts_text(counts)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +172,7 @@ class Triangulate(Reading, Choosing, Working):
                 pairs=pairs,
                 num_threads=work.num_threads,
             )
-        console.say(", ".join(starmap(count_text, counts.items())))
+        console.say(counts_text(counts))
 
 
 def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> list[ImagePair]:

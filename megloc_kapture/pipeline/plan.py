@@ -35,7 +35,7 @@ from megloc_kapture.stages.stage import (
     ROOT,
     Stage,
     StageWork,
-    count_text,
+    counts_text,
     is_below,
 )
 from megloc_kapture.stages.work import HERE, Work
@@ -421,6 +421,5 @@ def describe(report: StageReport) -> str:
         return f"{report.name}: used as is"
     if report.state == "pending":
         return f"{report.name}: would run ({report.why})"
-    counts = ", ".join(count_text(*count) for count in report.counts.items())
-    parts = filter(None, (counts, f"{report.seconds:.1f} s"))
+    parts = filter(None, (counts_text(report.counts), f"{report.seconds:.1f} s"))
     return f"{report.name}: {'; '.join(parts)}"

@@ -52,11 +52,14 @@ def count_label(name: str, value: float) -> tuple[str, str]:
     return words, f"{figure}{unit}"
 
 
-def count_text(name: str, value: float) -> str:
-    """Format a stage's count: ``12 images``, ``mean reprojection error: 0.74 px``."""
-    words, figure = count_label(name, value)
-    is_number = isinstance(value, int) and figure[-1].isdigit()
-    return f"{figure} {words}" if is_number else f"{words}: {figure}"
+def counts_text(counts: Mapping[str, float]) -> str:
+    """Format a stage's counts: ``12 images, mean reprojection error: 0.74 px``."""
+    texts = []
+    for name, value in counts.items():
+        words, figure = count_label(name, value)
+        is_number = isinstance(value, int) and figure[-1].isdigit()
+        texts.append(f"{figure} {words}" if is_number else f"{words}: {figure}")
+    return ", ".join(texts)
 
 
 # imported kapture folders
@@ -218,7 +221,7 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, work: StageWork) -> Mapping[str, float]:
-        """Write the outputs; return counts for the log, see :func:`count_text`."""
+        """Write the outputs; return counts for the log, see :func:`counts_text`."""
 
 
 # options that determine the local feature types
