@@ -20,7 +20,7 @@ from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import link_images, link_records, remove, safe_join
 from megloc_kapture.io.images import write_depth_map
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.depth import lift_with_covariances
@@ -130,8 +130,15 @@ def densify_map(
     :func:`~megloc_kapture.stages.map_refinement.refine_map`.
     """
     estimator = options.make_estimator(work.placement)
+    check_points(source, "densify")
+    records = source.root / "sensors" / "records_data"
+    require(records.is_dir(), "the images of the map are missing", path=records)
+    require(
+        not (records / FOLDER).exists(),
+        f"has images or depth maps in records_data/{FOLDER}: densified already?",
+        path=source.root,
+    )
     data = source.read()
-    _check(source, data)
     fit = fitted_to_poses(source, options.max_size_px)
     indices = [index_map(source, local_type) for local_type in source.observations()]
     rows = _plan(source, indices, fit, restrictions)
@@ -175,22 +182,6 @@ def _link_images_and_masks(source: KaptureFolder, output: Path) -> None:
     records = source.root / "sensors" / "records_data"
     link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
     link_images(source.root, output, ("masks",))
-
-
-def _check(source: KaptureFolder, data: KaptureData) -> None:
-    check_points(source, "densify")
-    records = source.root / "sensors" / "records_data"
-    require(records.is_dir(), "the images of the map are missing", path=records)
-    require(
-        not (records / FOLDER).exists(),
-        f"has images or depth maps in records_data/{FOLDER}",
-        path=source.root,
-    )
-    require(
-        not any(f"{sensor}_mvs" in data.sensors for sensor in data.sensors),
-        "has a sensor CAMERA_mvs: densified already?",
-        path=source.root,
-    )
 
 
 # ------------------------------------------------------------------------------------ planning

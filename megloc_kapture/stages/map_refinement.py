@@ -98,7 +98,7 @@ class MapSelection:
         point_ids = _joined([seen.point_ids for seen in types], np.int64)
         image_ids = _joined(rows, np.int32)
         # each type is sorted by point; sort all types together by point
-        self._order: Any = slice(None) if len(types) == 1 else np.argsort(point_ids, kind="stable")
+        self._order = np.argsort(point_ids, kind="stable")
         self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
         self.kept = self.image_ids >= 0

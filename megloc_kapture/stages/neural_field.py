@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from megloc_kapture.errors import DataError, check_option, require
+from megloc_kapture.errors import check_option, require
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.files import (
     read_content,
@@ -233,10 +233,6 @@ def render_along(
     """
     poses = data.poses()
     require(poses, "no image here has a pose")
-    stems = {Path(name).with_suffix(""): name for name in poses}
-    for name in poses:
-        if (other := stems[Path(name).with_suffix("")]) != name:
-            raise DataError(f"{name!r} and {other!r} would be rendered into one file")
     known = open_field(field)
     if appearance is not None:
         known.appearance_of(appearance)

@@ -257,19 +257,18 @@ _Carried = Mapping[str, Mapping[str, RigidTransform]]
 def _carried(data: KaptureData) -> _Carried:
     """Return ``sensor_from_rig`` by sensor for each top-level rig, through nested rigs."""
 
-    def members(rig: str, above: frozenset[str]) -> dict[str, RigidTransform]:
-        require(rig not in above, f"rig {rig!r} contains itself")
+    def members(rig: str) -> dict[str, RigidTransform]:
         sensors = {}
         for member, member_from_rig in data.rigs[rig].items():
             if member not in data.rigs:
                 sensors[member] = member_from_rig
                 continue
-            for sensor, sensor_from_member in members(member, above | {rig}).items():
+            for sensor, sensor_from_member in members(member).items():
                 sensors[sensor] = sensor_from_member @ member_from_rig
         return sensors
 
     on_others = {member for parts in data.rigs.values() for member in parts}
-    return {rig: members(rig, frozenset()) for rig in sorted(data.rigs) if rig not in on_others}
+    return {rig: members(rig) for rig in sorted(data.rigs) if rig not in on_others}
 
 
 def _rigs_of(carried: _Carried) -> dict[str, list[str]]:

@@ -132,7 +132,7 @@ def write_points(
         names = tuple(sorted({*seen.image_names, *(image for image, _ in new)}))
         row_of = {name: row for row, name in enumerate(names)}
         rows = np.array([row_of[name] for name in seen.image_names], np.int32)
-        image_ids = [rows[seen.image_ids] if len(rows) else seen.image_ids]
+        image_ids = [rows[seen.image_ids]]
         image_ids += [
             np.full(len(of_image.xyz), row_of[image], np.int32) for image, of_image in new
         ]
