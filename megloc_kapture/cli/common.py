@@ -6,8 +6,7 @@ import logging
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from itertools import starmap
@@ -177,13 +176,13 @@ class Working(Common):
     def placement(self) -> Placement:
         return AUTO
 
-    def open_executor(self, output: Path) -> AbstractContextManager[Executor | None]:
-        return open_executor(self.executor, self.workers, self.scheduler, output)
-
     @contextmanager
     def working(self, output: Path) -> Iterator[Work]:
         folder = output if output.is_dir() else output.absolute().parent
-        with single_threaded(), self.open_executor(folder) as executor:
+        with (
+            single_threaded(),
+            open_executor(self.executor, self.workers, self.scheduler, folder) as executor,
+        ):
             yield Work(
                 executor,
                 self.console().track,

@@ -145,11 +145,8 @@ class Synth(Working):
     def run(self, console: Console) -> None:
         changes = {"seed": self.seed, **assigned(self.set)}
         twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
-        with (
-            staged_output(self.output, kind=DATASET, force=self.force) as out,
-            self.open_executor(out) as executor,
-        ):
-            counts = twin.write(out, Work(executor, console.track))
+        with self.staged(self.output, DATASET, force=self.force) as (out, work):
+            counts = twin.write(out, work)
         console.counts(counts)
         console.result(f"rendered: {self.output}")
 

@@ -103,7 +103,7 @@ class MapRefiners:
                 "colmap --unit m` declares that a COLMAP model is in metres"
             )
         self.refiners = tuple(options.make_refiners(placement))
-        self.map, self._restrictions, self._options = mapping, restrictions, options
+        self.map, self._restrictions = mapping, restrictions
         self._verdicts: dict[str, list[Consistency | None]] = {}
         self._lock = threading.Lock()
 
