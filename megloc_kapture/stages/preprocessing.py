@@ -77,12 +77,10 @@ class MaskOptions(Options):
         default=None, description="folder of masks IMAGE.png, 0 for ignored pixels"
     )
 
-    def make_classes(
-        self, placement: Placement, segmenter: Segmenter | None = None
-    ) -> ClassMasks | None:
-        if segmenter is None and self.segmenter is not None:
-            segmenter = load_chosen(SEGMENTERS, self.segmenter, placement)
-        return None if segmenter is None else ClassMasks.of(segmenter, self.dynamic)
+    def make_classes(self, placement: Placement) -> ClassMasks | None:
+        if self.segmenter is None:
+            return None
+        return ClassMasks.of(load_chosen(SEGMENTERS, self.segmenter, placement), self.dynamic)
 
 
 def mask_files(
@@ -141,7 +139,7 @@ class ClassMasks:
     dynamic: tuple[str, ...]
 
     @classmethod
-    def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
+    def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None) -> ClassMasks:
         """Create with the given dynamic classes, by default the segmenter's."""
         wanted = segmenter.dynamic if dynamic is None else dynamic
         unknown = sorted(set(wanted) - set(segmenter.classes))
@@ -322,7 +320,6 @@ def preprocess_images(
     output: Path,
     options: PreprocessingOptions,
     *,
-    segmenter: Segmenter | None = None,
     sequences: Sequence[KaptureFolder] = (),
     work: Work = HERE,
 ) -> dict[str, float]:
@@ -336,7 +333,7 @@ def preprocess_images(
     """
     if output.resolve().is_relative_to(folder.root.resolve()):
         raise OutputError(f"{output}: is inside the input kapture folder, which is not modified")
-    classes = options.masks.make_classes(work.placement, segmenter)
+    classes = options.masks.make_classes(work.placement)
     data = folder.read()
     plans = _plans(data, options)
     images = data.image_names()

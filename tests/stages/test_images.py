@@ -26,6 +26,7 @@ from megloc_kapture.io.images import (
 )
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.preprocessing.masks import FixedMask
 from megloc_kapture.stages import work as devices
 from megloc_kapture.stages.global_features import (
@@ -103,10 +104,15 @@ def street(tmp_path: Path) -> KaptureFolder:
 def run(
     folder: KaptureFolder, output: Path, masks: dict[str, Any] | None = None, **options: Any
 ) -> tuple[KaptureFolder, dict[str, float]]:
-    """Pre-process with options; the segmenter and sequences go to the stage."""
-    stage = {name: options.pop(name) for name in ("segmenter", "sequences") if name in options}
-    chosen = PreprocessingOptions(masks=MaskOptions(**masks or {}), **options)
-    counts = preprocess_images(folder, output, chosen, **stage)
+    """Pre-process with options; sequences go to the stage, a segmenter replaces a plugin."""
+    sequences, segmenter = options.pop("sequences", ()), options.pop("segmenter", None)
+    plugin = {} if segmenter is None else {"segmenter": PluginChoice(name="replaced")}
+    chosen = PreprocessingOptions(masks=MaskOptions(**plugin, **masks or {}), **options)
+    with pytest.MonkeyPatch.context() as patch:
+        if segmenter is not None:
+            loaded = "megloc_kapture.stages.preprocessing.load_chosen"
+            patch.setattr(loaded, lambda *_: segmenter)
+        counts = preprocess_images(folder, output, chosen, sequences=sequences)
     return KaptureFolder(output), counts
 
 
