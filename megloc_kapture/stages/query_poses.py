@@ -99,63 +99,6 @@ class LocalizationOptions(Options):
         return ranker
 
 
-def localize_unit(
-    views: Sequence[QueryView],
-    candidates: Sequence[str],
-    options: LocalizationOptions,
-    *,
-    frame_of: Callable[[str], str],
-    centers: Mapping[str, NDArray[np.float64]],
-    ranker: PoseRanker,
-    scene: RankingScene,
-) -> list[Pose | Failure]:
-    """Localize one query, or the cameras of a rig together; return a result per camera.
-
-    A rig without a joint pose is localized camera by camera.
-
-    Parameters
-    ----------
-    candidates : map images, best first.
-    frame_of : returns the name of a map image's coordinate frame.
-    centers : camera centres (3,) of the candidates in the world.
-    """
-
-    def localize(together: Sequence[QueryView]) -> tuple[Pose | Failure, PoseProblem | None]:
-        matched = {image for view in together for image in view.matched_images()}
-        images = [image for image in candidates if image in matched]
-        if not images:
-            reason = "no map image matches" if candidates else "no map image is a candidate"
-            return Failure(reason), None
-        started = time.perf_counter()
-        indices = {id(typed.index): typed.index for view in together for typed in view.matches}
-        clusters = cluster_candidates(
-            images,
-            list(map(frame_of, images)),
-            options.clusters,
-            centers=centers,
-            indices=list(indices.values()),
-        )
-        seconds = {"clusters": time.perf_counter() - started}
-        result, problem = localize_in_clusters(
-            together,
-            clusters,
-            options.pose,
-            rank=lambda hypotheses: ranker.score(hypotheses, scene),
-            frames=[frame_of(cluster[0]) for cluster in clusters],
-            centers=centers,
-            min_confidence=options.min_confidence,
-            scene=scene,
-        )
-        return replace(result, seconds={**seconds, **result.seconds}), problem
-
-    if len(views) > 1:
-        result, problem = localize(views)
-        if isinstance(result, Pose) and problem is not None:
-            return poses_of_cameras(views, result, problem)
-    results = [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
-    return [replace(result, name=v.name) for v, result in zip(views, results, strict=True)]
-
-
 class QuerySource(Protocol):
     """A camera of a query, whose matches are computed live or read from kapture folders."""
 
@@ -199,20 +142,54 @@ def localize_query(
 
     ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
     With ``sure_confidence``, sources that are ``in_turn`` match the best candidates first, and more
-    of them only until all poses are certain (docs/performance.md). Parameters: see
-    :func:`localize_unit`.
+    of them only until all poses are certain (docs/performance.md). A rig without a joint pose is
+    localized camera by camera.
+
+    Parameters
+    ----------
+    frame_of : returns the name of a map image's coordinate frame.
+    centers : camera centres (3,) of the candidates in the world.
     """
 
-    def solve(count: int) -> list[Pose | Failure]:
-        return localize_unit(
-            [source.view(count) for source in sources],
-            interleave([source.candidates[:count] for source in sources]),
-            options,
-            frame_of=frame_of,
+    def localize(
+        together: Sequence[QueryView], candidates: Sequence[str]
+    ) -> tuple[Pose | Failure, PoseProblem | None]:
+        matched = {image for view in together for image in view.matched_images()}
+        images = [image for image in candidates if image in matched]
+        if not images:
+            reason = "no map image matches" if candidates else "no map image is a candidate"
+            return Failure(reason), None
+        started = time.perf_counter()
+        indices = {id(typed.index): typed.index for view in together for typed in view.matches}
+        clusters = cluster_candidates(
+            images,
+            list(map(frame_of, images)),
+            options.clusters,
             centers=centers,
-            ranker=ranker,
+            indices=list(indices.values()),
+        )
+        seconds = {"clusters": time.perf_counter() - started}
+        result, problem = localize_in_clusters(
+            together,
+            clusters,
+            options.pose,
+            rank=lambda hypotheses: ranker.score(hypotheses, scene),
+            frames=[frame_of(cluster[0]) for cluster in clusters],
+            centers=centers,
+            min_confidence=options.min_confidence,
             scene=scene,
         )
+        return replace(result, seconds={**seconds, **result.seconds}), problem
+
+    def solve(count: int) -> list[Pose | Failure]:
+        views = [source.view(count) for source in sources]
+        candidates = interleave([source.candidates[:count] for source in sources])
+        if len(views) > 1:
+            result, problem = localize(views, candidates)
+            if isinstance(result, Pose) and problem is not None:
+                return poses_of_cameras(views, result, problem)
+        alone = [QueryView(view.name, view.camera, view.matches) for view in views]
+        return [replace(localize([view], candidates)[0], name=view.name) for view in alone]
 
     num_candidates = max((len(source.candidates) for source in sources), default=0)
     sure, count = options.sure_confidence, _FIRST_TURN

@@ -40,7 +40,7 @@ from megloc_kapture.refinement.references import Displacement
 from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
-from megloc_kapture.stages.query_poses import LocalizationOptions, localize_query, localize_unit
+from megloc_kapture.stages.query_poses import LocalizationOptions, StoredSource, localize_query
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
@@ -95,7 +95,9 @@ class Candidates:
 
     def view(self, count: int) -> QueryView:
         self.asked.append(count)
-        return QueryView("q", cast(Camera, None), ())
+        index = MapIndex.build(np.zeros((0, 3)), (), *np.zeros((3, 0), np.int32))
+        matches = [("0", np.zeros((1, 2), np.int64), np.ones(1))]
+        return QueryView("q", cast(Camera, None), (TypedMatches(index, np.zeros((0, 2)), matches),))
 
 
 @pytest.mark.parametrize(
@@ -117,16 +119,16 @@ def test_candidates_are_added_until_the_pose_is_confident(
 ) -> None:
     source = Candidates(count, in_turn)
 
-    def solve(*_: Any, **__: Any) -> list[Pose]:
+    def solve(*_: Any, **__: Any) -> tuple[Pose, None]:
         results = {8: (0.99, 29), 16: (0.89, 30), 32: (0.9, 30)}
         confidence, inliers = results.get(source.asked[-1], (0.95, 99))
-        return [Pose(RigidTransform.identity(), 100, inliers, confidence=confidence)]
+        return Pose(RigidTransform.identity(), 100, inliers, confidence=confidence), None
 
-    monkeypatch.setattr("megloc_kapture.stages.query_poses.localize_unit", solve)
+    monkeypatch.setattr("megloc_kapture.stages.query_poses.localize_in_clusters", solve)
     nothing: Any = None
     localize_query(
         [source],
-        LocalizationOptions(sure_confidence=sure),
+        LocalizationOptions(sure_confidence=sure, clusters=ClusterOptions(by="none")),
         frame_of=lambda _: "",
         centers={},
         ranker=nothing,
@@ -159,9 +161,9 @@ def test_clusters_with_equal_poses_are_merged_within_a_frame(
     halves = zip("ab", np.split(rows, 2), strict=True)
     matches = [(name, np.stack([half] * 2, axis=1), np.full(50, 0.9)) for name, half in halves]
     seen_px = project(camera, pose, points).astype(np.float32)
-    (found,) = localize_unit(
-        [QueryView("q", camera, (TypedMatches(index, seen_px, matches),))],
-        ["a", "b"],
+    view = QueryView("q", camera, (TypedMatches(index, seen_px, matches),))
+    (found,) = localize_query(
+        [StoredSource(view, ["a", "b"])],
         LocalizationOptions(clusters=ClusterOptions(by="poses", radius=1.0)),
         frame_of=dict(zip("ab", frames, strict=True)).__getitem__,
         centers={"a": np.zeros(3), "b": np.full(3, 9.0)},
