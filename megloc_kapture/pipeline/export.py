@@ -314,8 +314,8 @@ def _posed_images(
     data, (scaled, errors) = folder.read(), cameras_of_folder(folder)
     if errors:
         raise errors[0]
-    stored = {key: data.sensors[key].camera() for key in scaled}
-    warn_of_scaled(folder.root, [(stored[key], scaled[key]) for key in scaled])
+    pairs = [(data.sensors[key].camera(), camera) for key, camera in scaled.items()]
+    warn_of_scaled(folder.root, pairs)
     posed = []
     for image, pose in sorted(data.poses().items()):
         timestamp, device = data.record_of(image)
