@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,31 +58,13 @@ class LiftedPoints:
     keypoint_ids: NDArray[np.int64]
 
 
-def stereo_images(folder: KaptureFolder) -> dict[str, tuple[str, ...]]:
-    """Return the images with stereo depth, each with the source images it was compared with."""
-    path = folder.root / DEPTH_FILE
-    rows = read_depth_rows(path) if path.is_file() else []
-    return {row.image: row.sources for row in sorted(rows, key=lambda r: r.image) if not row.reason}
-
-
 def depth_path(image: str) -> str:
     return f"{FOLDER}/{image}.depth"
 
 
-def side_file(root: Path, image: str, kind: Literal["sigma", "normals"]) -> Path:
+def side_file(root: Path, image: str, kind: str) -> Path:
     """Return the path of a file outside the kapture format; see the module's docstring."""
     return safe_join(root / "sensors" / FOLDER, f"{image}.{kind}.npy")
-
-
-def read_beside(
-    root: Path, image: str, kind: Literal["sigma", "normals"]
-) -> NDArray[np.float32] | None:
-    """Read float32 standard deviations (H, W) or normals (H, W, 3); None if missing."""
-    path = side_file(root, image, kind)
-    if not path.is_file():
-        return None
-    values = np.load(path).astype(np.float32)
-    return np.asarray(values / np.float32(127) if kind == "normals" else values)
 
 
 def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: int) -> KaptureData:
@@ -165,7 +146,8 @@ def fuse_depth(
     """
     path = densified.root / DEPTH_FILE
     require(path.is_file(), "no densified map: reconstruction/depth.csv is missing", path=path)
-    images = stereo_images(densified)
+    rows = sorted(read_depth_rows(path), key=lambda row: row.image)
+    images = {row.image: row.sources for row in rows if not row.reason}
     jobs = [
         (image, [other for other in others if other < image and other in images])
         for image, others in images.items()
@@ -190,14 +172,15 @@ def _points(
     rows, columns = np.nonzero(new)
     pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
     in_camera = pixels @ np.linalg.inv(pinhole_matrix(view.camera)).T * depth[new][:, None]
-    sigma = read_beside(folder.root, image, "sigma")
-    normals = read_beside(folder.root, image, "normals")
-    assert sigma is not None and normals is not None
+    sigma, normals = (
+        np.load(side_file(folder.root, image, kind))[new].astype(np.float64)
+        for kind in ("sigma", "normals")
+    )
     return (
         view.cam_from_world.inverse().apply(in_camera),
         view.image[new].astype(np.float64),
-        normals[new].astype(np.float64) @ view.cam_from_world.rotation_matrix(),
-        sigma[new].astype(np.float64),
+        normals / 127 @ view.cam_from_world.rotation_matrix(),
+        sigma,
     )
 
 

@@ -47,7 +47,7 @@ from megloc_kapture.stages.map_refinement import (
     refine_map,
 )
 from megloc_kapture.stages.scene import depth_records, index_map, read_depth
-from megloc_kapture.stages.stereo_depth import DEPTH_FILE, fuse_depth, read_beside, side_file
+from megloc_kapture.stages.stereo_depth import DEPTH_FILE, fuse_depth, side_file
 from megloc_kapture.values import Camera, RigidTransform
 
 FAST = PluginChoice(name="sweep", options={"passes": 1, "max_planes": 48})
@@ -82,8 +82,8 @@ def test_kapture_reads_accurate_depth_maps(densified: KaptureFolder) -> None:
         assert known.mean() > 0.4
         assert np.mean(np.abs(found - exact)[known] < 0.02 * exact[known]) > 0.95
         assert not found[exact == 0].any() or np.mean(found[exact == 0] > 0) < 0.1
-        sigma = read_beside(densified.root, image, "sigma")
-        assert sigma is not None and ((sigma > 0) == (found > 0)).all()
+        sigma = np.load(side_file(densified.root, image, "sigma"))
+        assert ((sigma > 0) == (found > 0)).all()
         normals = np.load(side_file(densified.root, image, "normals"))
         lengths = np.linalg.norm(normals[found > 0].astype(float), axis=1)
         np.testing.assert_allclose(lengths, 127, atol=1.5)
@@ -144,8 +144,8 @@ def test_resolution_follows_the_accuracy_of_the_poses(world: Any, tmp_path: Path
     densify_map(folder, tmp_path / "out", options)
     out = KaptureFolder(tmp_path / "out")
     for image, record in depth_records(out.read()).items():
-        depth, sigma = read_depth(out, record), read_beside(out.root, image, "sigma")
-        assert max(depth.shape) == fitted.max_size_px and sigma is not None
+        depth, sigma = read_depth(out, record), np.load(side_file(out.root, image, "sigma"))
+        assert max(depth.shape) == fitted.max_size_px
         # half a pixel at 4 to 6 m with a baseline of 1 m is 2 to 4 % of the depth
         assert 0.02 < np.median(sigma[depth > 0] / depth[depth > 0]) < 0.08
 
