@@ -33,7 +33,6 @@ from megloc_kapture.pipeline.presets import (
     options_of,
     options_of_preset,
 )
-from megloc_kapture.pipeline.queries import Preprocessor
 from megloc_kapture.plugin_loading import load_plugin, plugin_class, plugin_names
 from megloc_kapture.plugins import (
     DATASETS,
@@ -196,7 +195,7 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
             return
     options = options_of_preset(DEFAULT_PRESET)
     types = local_types_of(opened, options)
-    retrieval = MapMatching(opened, options, types, Preprocessor(options))
+    retrieval = MapMatching(opened, options, types)
     line(console, "retrieval", retrieval.describe_candidates(()))
     if brought := opened.global_types:
         text = retrieval.describe_candidates(brought)

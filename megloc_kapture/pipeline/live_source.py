@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, require
+from megloc_kapture.errors import DataError, check_option, require
 from megloc_kapture.features.vlad import Vocabulary, aggregate, train_vlad
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.cluster_poses import Clock
 from megloc_kapture.localization.map_index import ImageMatches, QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
-from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage
+from megloc_kapture.pipeline.queries import Query, QueryImage
 from megloc_kapture.plugin_loading import load_chosen, plugin_names
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
@@ -47,6 +47,7 @@ from megloc_kapture.stages.matches import (
     verified,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
+from megloc_kapture.stages.preprocessing import ClassMasks, MaskOptions
 from megloc_kapture.stages.reranking import counted, rerank
 from megloc_kapture.stages.work import BATCH, batched
 from megloc_kapture.values import RigidTransform
@@ -291,7 +292,7 @@ class _GlobalType:
 
 
 class MapMatching:
-    """Retrieval, matching and reranking of queries against a map; thread-safe.
+    """Preparation, retrieval, matching and reranking of queries against a map; thread-safe.
 
     Retrieval uses the global features that both map and query have. Without any, it uses the types
     in the options that are VLAD or stored in the map; without these, all types in the options.
@@ -303,13 +304,25 @@ class MapMatching:
         kapture_map: KaptureMap,
         options: PipelineOptions,
         types: Sequence[LocalType],
-        preprocessor: Preprocessor,
     ) -> None:
         self._map, self.options, self.types = kapture_map, options, types
-        self._preprocessor = preprocessor
+        masks = options.preprocessing.masks
+        check_option(
+            masks == MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic),
+            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images "
+            "(`megloc preprocess`); give the mask of a query as Query(mask=...)",
+        )
         self._vectors: dict[str, NDArray[np.float32]] = {}
         self._vocabularies: dict[str, tuple[Vocabulary, VladSettings]] = {}
         self._lock = threading.RLock()
+
+    def image(self, query: Query) -> QueryImage:
+        """Prepare a query lazily, as the stage of pre-processing does."""
+        return QueryImage(query, self.options, lambda: self._classes)
+
+    @cached_property
+    def _classes(self) -> ClassMasks | None:
+        return self.options.preprocessing.masks.make_classes(self.options.placement)
 
     def features(self, image: QueryImage) -> list[Features]:
         """Return the features of a query, given or extracted, by keypoints type."""
@@ -508,7 +521,7 @@ class MapMatching:
 
     def _map_image(self, name: str) -> QueryImage:
         pixels = read_stored_image(self._map.folder, name)
-        return self._preprocessor.of(Query(self._map.camera(name), pixels, name))
+        return self.image(Query(self._map.camera(name), pixels, name))
 
     def _vlad(self, kind: _GlobalType) -> tuple[Vocabulary, VladSettings]:
         with self._lock:

@@ -16,7 +16,7 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import Preprocessor, Query, Unit
+from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
@@ -58,7 +58,6 @@ class Localizer:
         where = {"device": device, "precision": precision}
         self.options = options or options_of_preset(preset, changes=[where])
         self._ranker = self.options.localization.make_ranker(self.options.placement)
-        self._preprocessor = Preprocessor(self.options)
         self.refiners = MapRefiners(
             kapture_map.folder,
             kapture_map.restrictions,
@@ -66,9 +65,9 @@ class Localizer:
             self.options.placement,
         )
         self.types = local_types_of(kapture_map, self.options)
+        self.matching = MapMatching(kapture_map, self.options, self.types)
         for local in self.types:
             local.prepare()
-        self.matching = MapMatching(kapture_map, self.options, self.types, self._preprocessor)
 
     def localize(
         self,
@@ -138,7 +137,7 @@ class Localizer:
 
     def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
         with single_threaded():
-            images = [self._preprocessor.of(query) for query, _ in unit]
+            images = [self.matching.image(query) for query, _ in unit]
             sources = [
                 LiveSource(self.matching, image, cam_from_rig)
                 for image, (_, cam_from_rig) in zip(images, unit, strict=True)
@@ -176,7 +175,7 @@ class Localizer:
 
     def ranked(self, query: Query) -> list[str]:
         """Return the most similar map images of a query, best first, with reranking if enabled."""
-        return self.matching.ranked(self._preprocessor.of(query))
+        return self.matching.ranked(self.matching.image(query))
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, check_option, require
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
 from megloc_kapture.plugins import DepthView, GlobalFeatureExtractor, LocalFeatureExtractor
-from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, carry_points, plan_frame
+from megloc_kapture.preprocessing.frames import FrameOptions, carry_points, plan_frame
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.local_features import check_size, extract_all, read_mask
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.preprocessing import ClassMasks, MaskOptions, ProcessedFrame
+from megloc_kapture.stages.preprocessing import ClassMasks, ProcessedFrame
 from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform
 
 
@@ -97,38 +96,20 @@ class Query:
         return image
 
 
-class Preprocessor:
-    """Preprocesses query images like :mod:`megloc_kapture.stages.preprocessing`."""
-
-    def __init__(self, options: PipelineOptions) -> None:
-        self._options = options
-        self.mask_margin_px = options.mask_margin_px
-        masks = options.preprocessing.masks
-        check_option(
-            masks == MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic),
-            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images "
-            "(`megloc preprocess`); give the mask of a query as Query(mask=...)",
-        )
-
-    def of(self, query: Query) -> QueryImage:
-        """Prepare a query lazily; with given local features, neither resize nor undistort it."""
-        frame = FrameOptions() if query.features else self._options.preprocessing
-        return QueryImage(query, plan_frame(query.camera, frame), self)
-
-    @cached_property
-    def classes(self) -> ClassMasks | None:
-        return self._options.preprocessing.masks.make_classes(self._options.placement)
-
-
 class QueryImage(ProcessedFrame):
-    """Preprocessed pixels, mask and depth of a query, computed lazily, with the matching camera."""
+    """Preprocessed pixels, mask and depth of a query, computed lazily, with the matching camera.
 
-    def __init__(self, query: Query, plan: FramePlan, preprocessor: Preprocessor) -> None:
-        super().__init__(
-            query.name, plan, query.read_image, self._own_mask, lambda: preprocessor.classes
-        )
-        self.query, self._preprocessor = query, preprocessor
-        self.camera: Camera = plan.processed
+    A query with given local features is neither resized nor undistorted.
+    """
+
+    def __init__(
+        self, query: Query, options: PipelineOptions, classes: Callable[[], ClassMasks | None]
+    ) -> None:
+        frame = FrameOptions() if query.features else options.preprocessing
+        plan = plan_frame(query.camera, frame)
+        super().__init__(query.name, plan, query.read_image, self._own_mask, classes)
+        self.query, self.camera = query, plan.processed
+        self._mask_margin_px = options.mask_margin_px
 
     def in_original(self, pose: Pose) -> Pose:
         """Convert a pose's camera and inlier pixels to the original image."""
@@ -153,7 +134,7 @@ class QueryImage(ProcessedFrame):
     @property
     def feature_mask(self) -> NDArray[np.bool_] | None:
         mask = self.mask
-        return None if mask is None else with_margin(mask, self._preprocessor.mask_margin_px)
+        return None if mask is None else with_margin(mask, self._mask_margin_px)
 
     def extract(self, extractor: LocalFeatureExtractor) -> LocalFeatures:
         return extract_all(extractor, [(self.pixels, self.feature_mask)], [self.query.name])[0]
