@@ -25,9 +25,6 @@ from megloc_kapture.errors import DataError, MeglocError, OutputError, require
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-# ------------------------------------------------------------------------------------ reading
-
-
 def read_content(path: Path | str) -> bytes:
     with reading(path):
         return Path(path).read_bytes()
@@ -59,15 +56,23 @@ def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
         raise DataError("cannot read: the file is missing", path=path) from error
     except OSError as error:
         reason = "cannot read" if error.strerror or not what else f"not {what}, or broken"
-        raise DataError(f"{reason}: {_text_of(error)}", path=path) from error
+        raise DataError(f"{reason}: {_text_of(error, path)}", path=path) from error
     except Exception as error:  # libraries raise many kinds of errors for broken files
         if not what or isinstance(error, MeglocError):
             raise
-        raise DataError(f"not {what}, or broken: {_text_of(error)}", path=path) from error
+        raise DataError(f"not {what}, or broken: {_text_of(error, path)}", path=path) from error
 
 
-def _text_of(error: Exception) -> str:
-    """Return the first sentence of an error, without memory addresses, which vary."""
+def _text_of(error: Exception, path: Path | str | None) -> str:
+    """Describe an incomplete download, or return an error's first sentence without addresses."""
+    with contextlib.suppress(OSError), open(path or "", "rb") as file:
+        start = file.read(100).lstrip()
+        if not start:
+            return "the file is empty"
+        if start.startswith(b"version https://git-lfs"):
+            return "a pointer of Git LFS; fetch the file with `git lfs pull`"
+        if start[:9].lower() in (b"<!doctype", b"<html>", b"<html lan"):
+            return "a web page; download the file itself"
     text = getattr(error, "strerror", None) or str(error)
     return " ".join(re.sub(r"<\S+ object at \S+>|[.;]\s.*", "", text, flags=re.S).split())
 
@@ -84,9 +89,6 @@ def named(
             raise
         message = f"{about}: {error.message}" if about else error.message
         raise DataError(message, path=path, line=line) from error.__cause__
-
-
-# ------------------------------------------------------------------------------------ paths
 
 
 def has_control_characters(text: str) -> bool:
@@ -124,9 +126,6 @@ def safe_join(root: Path, relative_text: str) -> Path:
     return Path(root) / check_relative(relative_text)
 
 
-# -------------------------------------------------------------------------------- temporary names
-
-
 TEMPORARY = ".megloc-"  # prefix of temporary names, which all readers skip
 
 
@@ -148,9 +147,6 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-# ------------------------------------------------------------------------------------ writing
 
 
 def output_error(path: Path | str, error: OSError) -> OutputError:
@@ -198,16 +194,10 @@ def write_bytes(path: Path | str, content: bytes) -> None:
         file.write(content)
 
 
-# ------------------------------------------------------------------------------------ folders
-
-
 def user_cache() -> Path:
     """Return the user's cache folder, which may not exist."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache) / "megloc-kapture"
-
-
-# -------------------------------------------------------------------------------------- links
 
 
 def link_as_text(path: Path) -> str:
@@ -287,9 +277,6 @@ def _new_link(link: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise output_error(link, error) from error
-
-
-# --------------------------------------------------------------------------------------- JSON
 
 
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:

@@ -88,6 +88,9 @@ def staged_output(
     folder = Path(folder)
     if folder.resolve() in {Path(path).resolve() for path in inputs if path is not None}:
         raise OutputError(f"{folder}: is also an input, which would be lost; give another folder")
+    is_other = (folder / "sensors" / "sensors.txt").is_file() and _read_mark(folder)[:1] != [kind]
+    if is_other and not adds:
+        raise OutputError(f"{folder}: has other kapture data, which is kept; give an empty folder")
     check_claim(folder, kind=kind, force=force)
     place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
     staging = place / temporary_name()

@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import atomic_write, link_file, link_images, safe_join, write_bytes
+from megloc_kapture.io.files import (
+    atomic_write,
+    link_file,
+    link_images,
+    reading,
+    safe_join,
+    write_bytes,
+)
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter
 from megloc_kapture.io.output_folders import MARKER, claim_folder, files_below, staged_output
 
@@ -200,6 +207,41 @@ def test_an_output_that_is_an_input_is_refused_even_if_forced(tmp_path: Path) ->
         with pytest.raises(OutputError, match=f"{place}: is also an input"):
             write_output(place, "a", force=True, inputs=(None, tmp_path / "map"))
     assert names_in(tmp_path / "map") == set()
+
+
+def test_kapture_data_of_others_is_not_replaced_even_if_forced(tmp_path: Path) -> None:
+    """For example the map, if it is given as the output, too."""
+    place = tmp_path / "map"
+    (place / "sensors").mkdir(parents=True)
+    (place / "sensors" / "sensors.txt").write_text("theirs")
+    before = tree(place)
+    for force in (False, True):
+        with pytest.raises(OutputError, match="map: has other kapture data, which is kept; give"):
+            write_output(place, "sensors/sensors.txt", force=force)
+    assert tree(place) == before
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
+            "a pointer of Git LFS; .*`git lfs pull`",
+        ),
+        (b"\n<!DOCTYPE html><html>", "a web page; download the file itself"),
+        (b"P6 1", "no header"),
+    ],
+)
+def test_what_lies_in_place_of_a_file_is_named(
+    tmp_path: Path, content: bytes, message: str
+) -> None:
+    (tmp_path / "net.pth").write_bytes(content)
+    with (
+        pytest.raises(DataError, match=f"net.pth: not weights, or broken: {message}$"),
+        reading(tmp_path / "net.pth", "weights"),
+    ):
+        raise ValueError("no header")
 
 
 @pytest.mark.parametrize("error", [DataError("broken"), KeyboardInterrupt()])
