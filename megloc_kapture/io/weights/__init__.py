@@ -11,6 +11,7 @@ from __future__ import annotations
 import glob
 import hashlib
 import os
+import re
 import shutil
 import tomllib
 import zipfile
@@ -50,13 +51,12 @@ FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
 UNVERIFIED = "unverified"  # subfolder of user files, used if the published file is missing
 _REGISTRY = Path(__file__).with_name("registry.toml")
 # keys under which training scripts keep the state dict
-_STATE_KEYS = ("state_dict", "model_state", "model", "extractor")
+_STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "net", "extractor")
+# prefixes from torch's parallel, lightning's and compiled modules
+_PREFIXES = re.compile(r"^(module\.|model\.|_orig_mod\.)+")
 _Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
 _Text = Annotated[str, StringConstraints(min_length=1)]
 _FileName = Annotated[str, AfterValidator(check_relative)]
-
-
-# ----------------------------------------------------------------------------------- registry
 
 
 class PublishedFile(Options):
@@ -124,9 +124,6 @@ def by_file_name(name: str) -> tuple[Weights, PublishedFile] | None:
 
 def _all_files() -> list[tuple[Weights, PublishedFile]]:
     return [(weights, file) for weights in registry().values() for file in weights.files]
-
-
-# ------------------------------------------------------------------------------------ folder
 
 
 class MissingWeightsError(DataError):
@@ -261,9 +258,6 @@ def sha256_of(file: WeightsFile) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
-# ----------------------------------------------------------------------------------- reading
-
-
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     """Read the tensors of a checkpoint by name, without the prefix ``module.``.
 
@@ -317,7 +311,7 @@ def _state_dict(content: Any, path: Path) -> dict[str, torch.Tensor]:
             content = content[key]
     items = content.items() if isinstance(content, Mapping) else ()
     tensors = {
-        str(key).removeprefix("module."): value.detach()
+        _PREFIXES.sub("", str(key)): value.detach()
         for key, value in items
         if isinstance(value, torch.Tensor)
     }
@@ -382,7 +376,7 @@ def add_weights(
     if expected is not None and expected.convert:
         command = how_to_convert(weights, source)
         raise DataError(f"is not read as it is; convert it once: {command}", path=source)
-    check_sha256(described, None if unverified else expected)
+    check_sha256(describe(weights.name, source), None if unverified else expected)
     read_weights(described)
     path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
     if path.exists() and not force:

@@ -252,6 +252,14 @@ def test_conversions_of_wrong_paths_are_refused(tmp_path: Path) -> None:
     assert convert_weights(source, output, force=True) == 1
 
 
+@pytest.mark.parametrize("key", ["model_state_dict", "state_dict", "net"])
+@pytest.mark.parametrize("prefix", ["", "module.", "model.", "_orig_mod.module."])
+def test_checkpoints_of_training_scripts_are_read(tmp_path: Path, key: str, prefix: str) -> None:
+    content = {"epoch": 3, key: {f"{prefix}conv.weight": torch.ones(1)}, "loss": torch.ones(1)}
+    torch.save(content, tmp_path / "x.pth")
+    assert read_weights(find_weights(str(tmp_path / "x.pth"))).keys() == {"conv.weight"}
+
+
 def test_a_checkpoint_may_hold_a_score_of_numpy(tmp_path: Path) -> None:
     for score in (np.float64(0.7), np.float32(0.7)):
         torch.save({"model_state": {"a": torch.ones(1)}, "best_score": score}, tmp_path / "x.pth")
