@@ -22,6 +22,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from megloc_kapture.errors import PluginError
 from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
@@ -198,7 +199,11 @@ def localize_in_clusters(
     if not attempts:
         return Failure("no match has a map point", seconds=clock.seconds), None
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
-    scores = iter(rank(hypotheses).tolist() if hypotheses else ())
+    of_ranker = np.asarray(rank(hypotheses) if hypotheses else (), np.float64)
+    if of_ranker.shape != (len(hypotheses),):
+        shape = of_ranker.shape
+        raise PluginError(f"the pose ranker's scores have shape {shape}, not ({len(hypotheses)},)")
+    scores = iter(of_ranker.tolist())
     ranked = tuple(
         each.result(None if each.hypothesis is None else next(scores)) for each in attempts
     )

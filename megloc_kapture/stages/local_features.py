@@ -190,15 +190,21 @@ def extract_all(
         frames,
         name=lambda k: f"image {names[k]}",
     )
-    return [_checked(extractor, *each) for each in zip(features, names, strict=True)]
+    return [_checked(extractor, *each) for each in zip(features, names, frames, strict=True)]
 
 
-def _checked(extractor: LocalFeatureExtractor, features: Any, image: str) -> LocalFeatures:
+def _checked(
+    extractor: LocalFeatureExtractor, features: Any, image: str, frame: Frame
+) -> LocalFeatures:
     who = f"plugin {extractor.name!r} on image {image}"
     if not isinstance(features, LocalFeatures):
         raise PluginError(f"{who}: got {type(features).__name__}, expected LocalFeatures")
     checked_array(who, features.keypoints_px, (None, None), "float32")
     checked_array(who, features.descriptors, (len(features.keypoints_px), None), "float32", "uint8")
+    xy, (height, width) = features.keypoints_px[:, :2], frame[0].shape[:2]
+    # detectors may refine a keypoint slightly beyond the border
+    if xy.shape[1] != 2 or (xy < -1).any() or (xy > (width + 1, height + 1)).any():
+        raise PluginError(f"{who}: keypoints outside of {width}x{height} pixels; give x, y")
     return features
 
 

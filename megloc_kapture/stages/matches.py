@@ -338,8 +338,11 @@ def match_all(
         others,
         name=names.__getitem__,
     )
-    for (matches, scores), other, name in zip(pairs, others, names, strict=True):
+    for pair, other, name in zip(pairs, others, names, strict=True):
         who = f"matcher {type(matcher).__name__} on {name}"
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise PluginError(f"{who}: got {type(pair).__name__}, expected (matches, scores)")
+        matches, scores = pair
         checked_array(who, matches, (None, 2), "int64", "int32", "uint64", "uint32")
         checked_array(who, scores, (len(matches),), "float32", "float64")
         bounds = len(a.keypoints_px), len(other.keypoints_px)

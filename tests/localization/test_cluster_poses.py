@@ -13,6 +13,7 @@ from poses import error_vector, rigid
 from pydantic import ValidationError
 from scipy.cluster.hierarchy import fcluster, linkage
 
+from megloc_kapture.errors import PluginError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import perturbed
 from megloc_kapture.localization import cluster_poses as module
@@ -132,8 +133,10 @@ def test_the_ranker_chooses_the_cluster() -> None:
     assert isinstance(result, Pose) and result.cluster == 1
     np.testing.assert_allclose(result.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-5)
     # ties go to the first
-    result, _ = localize(view(SHARES), rank=lambda hypotheses: np.ones(len(hypotheses)))
+    result, _ = localize(view(SHARES), rank=lambda hypotheses: [1] * len(hypotheses))
     assert isinstance(result, Pose) and result.cluster == 0
+    with pytest.raises(PluginError, match=r"ranker's scores have shape \(1,\), not \(2,\)"):
+        localize(view(SHARES), rank=lambda _: np.ones(1))
 
 
 def test_clusters_of_the_same_place_are_merged() -> None:

@@ -360,6 +360,20 @@ def test_wrong_features_of_a_plugin_are_refused(small_kapture: Any, tmp_path: Pa
         extract_local_features([folder], Inconsistent(), tmp_path / "features")
 
 
+@pytest.mark.parametrize("keypoint", [(20, 150), (-9, 5), (7,)], ids=["y, x", "negative", "x"])
+def test_keypoints_outside_of_the_image_are_refused(
+    small_kapture: Any, tmp_path: Path, keypoint: tuple[float, ...]
+) -> None:
+    class Mistaken(Inconsistent):
+        def extract(self, image: Image, mask: NDArray[np.bool_] | None = None) -> LocalFeatures:
+            one = np.ones(1, np.float32)
+            return LocalFeatures(np.array([keypoint], np.float32), one, one[:, None])
+
+    folder = small_kapture({"a.png": noise()})
+    with pytest.raises(PluginError, match="keypoints outside of 160x120 pixels; give x, y"):
+        extract_local_features([folder], Mistaken(), tmp_path / "features")
+
+
 class Colours:
     """Mean, deviation and first pixel of the colours: cheap and distinct."""
 

@@ -405,16 +405,18 @@ def test_the_best_pairs_are_those_with_most_verified_matches() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scores", "message"),
+    ("found", "message"),
     [
-        (np.ones(3), r"got float64 \(3,\), expected .*\(1\)"),
-        (np.ones(1), "outside 3 and 5 keypoints"),
+        ((np.array([[0, 5]]), np.ones(3)), r"got float64 \(3,\), expected .*\(1\)"),
+        ((np.array([[0, 5]]), np.ones(1)), "outside 3 and 5 keypoints"),
+        (np.array([[0, 4], [1, 3]]), r"got ndarray, expected \(matches, scores\)"),
+        (None, r"got NoneType, expected \(matches, scores\)"),
     ],
 )
-def test_wrong_matches_of_a_plugin_are_refused(scores: Any, message: str) -> None:
+def test_wrong_matches_of_a_plugin_are_refused(found: Any, message: str) -> None:
     class Mistaken:
         def match(self, a: Any, b: Any) -> Any:
-            return np.array([[0, 5]]), scores
+            return found
 
     def image(count: int) -> ImageFeatures:
         return ImageFeatures(np.zeros((count, 2), np.float32), np.zeros((count, 4)), 64, 48)
