@@ -40,6 +40,8 @@ UNREAD_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", 
 EXIF_DEVIATION, GUESS_DEVIATION = 0.1, 0.7
 # COLMAP's guess of the focal length, as a multiple of the larger side of the image
 _GUESS = 1.2
+# a longer focal length, as a multiple of the larger side, is no measurement (EXIF: 65535 mm)
+_LONGEST = 100
 _ORIENTATION, _MAKE, _MODEL, _EXIF, _GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
 # focal length in mm and 35 mm equivalent, focal plane resolution (x, y) and unit, image size
 _FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210, 0xA002, 0xA003)
@@ -57,9 +59,7 @@ _MOST_WHOLE_M = 100
 def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
     """Read an image as uint8 (H, W, 3), RGB, without transparency; see :func:`with_8_bits`."""
     check_image_file(Path(path))
-    content = read_content(path)
-    require(content, "empty file, not an image", path=path)
-    return decode_image_rgb(content, path)
+    return decode_image_rgb(read_content(path), path)
 
 
 def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[np.uint8]:
@@ -251,9 +251,6 @@ def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
     require(number != 0, "not a video, or OpenCV cannot read its frames", path=video)
 
 
-# ------------------------------------------------------------------------------ photographs
-
-
 @dataclass(frozen=True)
 class Photo:
     """The header of a photograph; ``camera`` describes the stored pixels.
@@ -319,7 +316,7 @@ def photo_of(image: Image.Image) -> Photo:
         focal = _tried(lambda: focal_from_exif(_blank_with_exif(exif, make, model, image.size)))
     # pillow and OpenCV apply the orientation of TIFF files themselves
     turned = orientation in range(2, 9) and image.format != "TIFF"
-    if focal is None:
+    if focal is None or focal > _LONGEST * max(image.size):
         camera = guessed_camera(width, height)
     else:
         camera = _centred(width, height, focal, EXIF_DEVIATION)

@@ -16,6 +16,7 @@ from megloc_kapture.io.images import (
     EXIF_DEVIATION,
     GUESS_DEVIATION,
     WRITABLE_SUFFIXES,
+    guessed_camera,
     image_size,
     is_image,
     photo_of,
@@ -158,6 +159,11 @@ def test_the_gps_position_of_a_photograph() -> None:
     photo = photo_of(image)
     assert (photo.orientation, photo.make) == (6, "Acme P1")
     assert photo.gps == pytest.approx((47.375, -8.541667, 400.0), abs=1e-6)
+
+
+def test_an_impossible_focal_length_in_exif_counts_as_missing(tmp_path: Path) -> None:
+    noise().save(tmp_path / "a.jpg", exif=exif_of({}, {FOCAL_35MM: 65535}))
+    assert read_photo(tmp_path / "a.jpg").camera == guessed_camera(64, 48)
 
 
 def test_images_are_recognised_by_their_content(tmp_path: Path) -> None:
