@@ -308,6 +308,7 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
     async def get_map() -> Response:
         return Response(overview, media_type="application/json")
 
+    @app.head("/health", include_in_schema=False)
     @app.get("/health", summary="Report that the service is running")
     async def health() -> dict[str, str]:
         return {"status": "ok"}

@@ -211,6 +211,7 @@ def test_token_protects_localization_and_map(localizer: Localizer) -> None:
                 assert token not in error and answer.headers["www-authenticate"] == "Bearer"
         for path in ("/", "/docs", "/openapi.json", "/health"):
             assert client.get(path).status_code == 200
+        assert client.head("/health").status_code == 200  # as monitors ask
         right = {"authorization": f"Bearer {token}"}
         no_image = client.post("/localize", content=b"x", headers=right)
         assert no_image.status_code == 415
