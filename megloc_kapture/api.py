@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError, suggestion
+from megloc_kapture.errors import DataError, OptionError, require, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import REPORT_HTML
 from megloc_kapture.features.image_bound import extract_bounded
@@ -54,7 +54,7 @@ from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, MAP, Stage
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
+from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose, check_camera
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -178,7 +178,7 @@ class Map:
                 raise OptionError(f"{query.root}: a kapture folder has its own cameras")
             many = query
         elif isinstance(query, list | tuple):
-            many = Photographs([Path(path) for path in query], camera)
+            many = Photographs(query, camera)
         elif isinstance(query, Path) and query.is_dir():
             many = Photographs([query], camera)
         else:
@@ -190,6 +190,19 @@ class Map:
         return Results(localizer, many, workers=workers)
 
 
+def check_image(image: Any) -> None:
+    """Raise DataError for other things than images, such as tensors, or None from cv2.imread."""
+    from PIL import Image
+
+    kind = type(image).__name__
+    if isinstance(image, np.ndarray):
+        kind = f"{image.dtype} {image.shape}"
+        fits = image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3 and image.size
+    else:
+        fits = isinstance(image, str | Path | Image.Image)
+    require(fits, f"an image is a file, uint8 (H, W, 3) RGB or a pillow image, got {kind}")
+
+
 def _query_of(
     image: Path | NDArray[np.uint8] | Image.Image,
     camera: Camera | None,
@@ -197,6 +210,7 @@ def _query_of(
 ) -> Query:
     name, orientation = "query", 1
     permitted = None if prior is None else tuple(prior)
+    check_image(image)
     if isinstance(image, Path):
         name = image.name  # as in a list or a folder
         if camera is None:
@@ -208,8 +222,6 @@ def _query_of(
         if camera is None:
             camera, image = photo.upright_camera, turned_upright(image, photo.orientation)
     elif camera is None:
-        if image.ndim != 3:
-            raise DataError(f"an image is uint8 (H, W, 3), got {image.dtype} {image.shape}")
         camera = guessed_camera(image.shape[1], image.shape[0])
     return Query(camera, image, name, prior=permitted, orientation=orientation)
 
@@ -305,11 +317,9 @@ def map_photographs(
     scale : ``"gps"`` for EXIF positions, or the names of two photographs and the distance between
         their cameras in metres. Without it the map is not metric, see ``map.kapture_map.unit``.
     mapper : COLMAP's mapper: incremental or global.
-    workspace : folder of all results, ``runs/IMAGES-PRESET`` by default. Up-to-date results in it
-        are reused. Its folder ``map`` is the map; its ``megloc/unregistered.csv`` lists the
+    workspace : ``runs/IMAGES-PRESET`` by default; ``megloc/unregistered.csv`` in it lists the
         photographs that are missing from the map.
-    workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
-    scheduler : address of a dask scheduler, whose workers are used instead.
+    workers, scheduler : as in :func:`build_map`.
     """
     paths = [Path(path) for path in ([images] if isinstance(images, str | Path) else images)]
     options = options_of_photographs(preset, set or {})
@@ -380,11 +390,9 @@ def run(
     ----------
     root : the dataset as published; searched below MEGLOC_DATA by default.
     preset : by default the preset in the dataset's benchmark file.
-    set : options, as ``{"localization.rank.name": "perceptual"}``.
     workspace : ``runs/DATASET-PRESET`` by default, and ``runs/kapture-ROOT-PRESET`` for kapture
         folders.
-    workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
-    scheduler : address of a dask scheduler, whose workers are used instead.
+    set, workers, scheduler : as in :func:`open_map` and :func:`build_map`.
     """
     chosen = choose_run(
         dataset, None if root is None else Path(root), preset=preset, assignments=set or {}
@@ -395,13 +403,18 @@ def run(
     return FinishedRun(made.root, pose_file, chosen.options)
 
 
-def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any) -> ImageFeatures:
+def extract(
+    features: str, image: Path | str | NDArray[np.uint8] | Image.Image, **options: Any
+) -> ImageFeatures:
     """Extract local features of an image with a named extractor.
 
-    ``image`` is an image file or uint8 (H, W, 3) RGB; ``options`` are the extractor's. PluginError
-    or MissingWeightsError if the extractor cannot be loaded.
+    ``image`` is as in :meth:`Map.localize`; ``options`` are the extractor's. PluginError or
+    MissingWeightsError if the extractor cannot be loaded.
     """
-    pixels = image if isinstance(image, np.ndarray) else read_image_rgb(Path(image))
+    check_image(image)
+    if isinstance(image, str | Path):
+        image = read_image_rgb(image)
+    pixels = image if isinstance(image, np.ndarray) else pillow_pixels(image)
     extracted = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), [(pixels, None)])[0]
     height, width = pixels.shape[:2]
     return ImageFeatures(extracted.keypoints_px, extracted.descriptors, width, height)
@@ -436,8 +449,18 @@ def solve_pose(
     points_world : (N, 3).
     max_error_px : inlier threshold of the reprojection error.
     """
-    options = AbsolutePoseOptions(max_error_px=max_error_px, min_inliers=min_inliers, seed=seed)
-    return absolute_pose(points_px, np.asarray(points_world, np.float64), camera, options)
+    check_camera(camera)
+    limits = {"max_error_px": max_error_px, "min_inliers": min_inliers, "seed": seed}
+    options = options_with(AbsolutePoseOptions, limits)
+    try:
+        pixels = np.asarray(points_px, np.float64).reshape(len(points_px), 2)
+        points = np.asarray(points_world, np.float64).reshape(len(pixels), 3)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            "2D-3D matches are points_px (N, 2) and points_world (N, 3), got "
+            f"{np.shape(points_px)} and {np.shape(points_world)}"
+        ) from error
+    return absolute_pose(pixels, points, camera, options)
 
 
 def train(

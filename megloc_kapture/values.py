@@ -96,10 +96,6 @@ class Camera:
         The centre of the first pixel is (0.5, 0.5).
     focal_deviation : relative standard deviation of the focal length. 0 means that it is known and
         fixed; otherwise the focal length is estimated with the pose.
-
-    Raises
-    ------
-    DataError : unknown model, wrong number of parameters, or an invalid size or parameter.
     """
 
     model: str
@@ -113,7 +109,12 @@ class Camera:
         if expected is None:
             known = ", ".join(CAMERA_MODEL_NUM_PARAMS)
             raise DataError(f"unknown camera model {self.model!r}; known: {known}")
-        object.__setattr__(self, "params", tuple(float(p) for p in self.params))
+        try:
+            object.__setattr__(self, "width", int(self.width))
+            object.__setattr__(self, "height", int(self.height))
+            object.__setattr__(self, "params", tuple(float(p) for p in self.params))
+        except (TypeError, ValueError) as error:  # for example a matrix K
+            raise DataError(f"camera model {self.model}: sizes and params are numbers") from error
         if len(self.params) != expected:
             raise DataError(
                 f"camera model {self.model} takes {expected} parameters, got {len(self.params)}"
@@ -137,6 +138,15 @@ class Camera:
     def from_colmap(cls, camera: Any) -> Camera:
         """Convert a ``pycolmap.Camera``; DataError for an unsupported model."""
         return cls(camera.model.name, camera.width, camera.height, tuple(camera.params))
+
+
+def check_camera(camera: Any) -> None:
+    """Raise DataError for other descriptions of a camera, such as a matrix K."""
+    if not isinstance(camera, Camera):
+        raise DataError(
+            "a camera is a megloc_kapture.Camera (Camera.from_colmap converts pycolmap's), "
+            f"got {type(camera)}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -205,6 +205,48 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "refused").exists()
 
 
+@pytest.mark.parametrize(
+    "image",
+    [None, b"", 3, iter([]), np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3)), np.zeros((3, 8, 8))],
+)
+def test_other_things_than_images_are_refused(built: megloc.Map, image: Any) -> None:
+    """Such as the None that cv2.imread returns for a missing file."""
+    message = r"an image is a file, uint8 \(H, W, 3\) RGB or a pillow image, got "
+    with pytest.raises(megloc.DataError, match=message):
+        built.localize(image)
+    with pytest.raises(megloc.DataError, match=message):
+        megloc.extract("rootsift", image)
+
+
+@pytest.mark.parametrize("camera", [np.eye(3), {"model": "PINHOLE"}, "PINHOLE", 500.0])
+def test_other_descriptions_of_a_camera_are_refused(
+    built: megloc.Map, scene: Path, camera: Any
+) -> None:
+    path = next((scene / "query" / "sensors" / "records_data").iterdir())
+    image = read_image_rgb(path)
+    points = np.ones((20, 3))
+    for refused in (
+        lambda: built.localize(image, camera),
+        lambda: built.localize([path], camera),
+        lambda: built.localizer().localize(image, camera),
+        lambda: megloc.solve_pose(points[:, :2], points, camera),
+    ):
+        with pytest.raises(megloc.DataError, match="a camera is a megloc_kapture.Camera"):
+            refused()
+
+
+def test_arrays_and_limits_of_a_pose_are_checked() -> None:
+    camera = megloc.Camera.pinhole(640, 480, 500)
+    px, points = np.ones((20, 2)), np.ones((20, 3))
+    for wrong in ((points, px), (px.T, points.T), (px[:9], points), (None, None)):
+        with pytest.raises(megloc.DataError, match=r"points_px \(N, 2\) and points_world \(N, 3\)"):
+            megloc.solve_pose(*wrong, camera)  # type: ignore[arg-type]
+    with pytest.raises(megloc.OptionError, match="max_error_px: it should be greater than 0"):
+        megloc.solve_pose(px, points, camera, max_error_px=0)
+    none: list[Any] = []
+    assert "0 2D-3D matches" in megloc.solve_pose(none, none, camera).reason  # type: ignore[arg-type]
+
+
 def test_importing_the_package_loads_no_network_and_no_solver() -> None:
     slow = {"torch", "scipy", "pandas", "numba", "cv2", "pycolmap"}
     # nor does the command line wait for figures

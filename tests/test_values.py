@@ -75,6 +75,8 @@ def test_a_camera_takes_numbers_of_any_kind() -> None:
     assert camera.params == (500.0, 510.0, 320.0, 240.0)
     assert all(type(p) is float for p in camera.params)
     assert hash(camera) == hash(Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.0, 240.0)))
+    fields: list[Any] = ["640", "480", "500", "510", "320", "240"]
+    assert Camera("PINHOLE", *fields[:2], fields[2:]) == camera  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -89,10 +91,12 @@ def test_a_camera_takes_numbers_of_any_kind() -> None:
         ("PINHOLE", 640, 480, (0, 500, 320, 240), "focal length 0.0 is not positive"),
         ("PINHOLE", 640, 480, (500, -500, 320, 240), "focal length -500.0 is not positive"),
         ("OPENCV_FISHEYE", 640, 480, (500, 0, 320, 240, 0, 0, 0, 0), "focal length 0.0"),
+        ("PINHOLE", 640, 480, np.eye(3), "PINHOLE: sizes and params are numbers"),
+        ("SIMPLE_PINHOLE", "wide", 480, (500, 320, 240), "sizes and params are numbers"),
     ],
 )
 def test_cameras_that_cannot_be(
-    model: str, width: int, height: int, params: tuple[float, ...], message: str
+    model: str, width: Any, height: int, params: Any, message: str
 ) -> None:
     with pytest.raises(DataError, match=message):
         Camera(model, width, height, params)

@@ -129,7 +129,7 @@ def camera_of_text(text: str) -> Camera:
         model, width, height, *params = text.split(",")
         return Camera(model.strip(), int(width), int(height), tuple(map(float, params)))
     except (ValueError, DataError) as error:
-        reason = error.message if isinstance(error, DataError) else "malformed"
+        reason = error.message if isinstance(error, DataError) else "neither a file nor a camera"
         raise OptionError(
             f"--camera {text}: {reason}; give MODEL,WIDTH,HEIGHT,PARAMETERS, as in "
             "SIMPLE_RADIAL,4032,3024,3100,2016,1512,0.02"

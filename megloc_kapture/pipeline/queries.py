@@ -20,7 +20,7 @@ from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.local_features import check_size, extract_all, read_mask
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import ClassMasks, ProcessedFrame
-from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform
+from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform, check_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +50,9 @@ class Query:
     mask: Path | NDArray[np.bool_] | None = None
     depth: DepthView | Callable[[], DepthView | None] | None = None
     orientation: int = 1
+
+    def __post_init__(self) -> None:
+        check_camera(self.camera)
 
     def read_mask(self) -> NDArray[np.bool_] | None:
         """Return the mask, bool (H, W), True = use, or None."""

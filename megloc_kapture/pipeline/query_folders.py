@@ -52,7 +52,7 @@ from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
 from megloc_kapture.stages.local_features import mask_path
 from megloc_kapture.stages.scene import depth_of
-from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
+from megloc_kapture.values import Camera, LocalFeatures, RigidTransform, check_camera
 
 _log = logging.getLogger(__name__)
 
@@ -335,6 +335,12 @@ class Photographs(Queries):
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be used; give 1 or more")
         check_option(paths, "no photographs are given; name image files or folders")
+        if not isinstance(camera, CameraList | None):
+            check_camera(camera)
+        check_option(
+            all(isinstance(path, str | Path) for path in paths),
+            "photographs are given as files or folders; localize arrays one at a time",
+        )
         roots = [Path(path) for path in paths]
         files = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent

@@ -120,6 +120,8 @@ def test_unusable_files_and_folders_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DataError, match=message):
             Photographs(paths)
+    with pytest.raises(OptionError, match="localize arrays one at a time"):
+        Photographs([np.zeros((8, 8, 3), np.uint8)])  # type: ignore[list-item]
     with pytest.raises(OptionError, match="no photographs are given"):
         Photographs([])
 
