@@ -321,13 +321,13 @@ def map_photographs(
         photographs that are missing from the map.
     workers, scheduler : as in :func:`build_map`.
     """
-    paths = [Path(path) for path in ([images] if isinstance(images, str | Path) else images)]
+    paths = [images] if isinstance(images, str | Path) else list(images)
     options = options_of_photographs(preset, set or {})
     photographs = Photographs(paths, camera)
     asked = () if scale is None else (scale,) if scale == "gps" else tuple(map(str, scale))
     known = photographs.known_cameras()
     structure = structure_options(photographs, mapper, asked, known_cameras=known)
-    title = paths[0].resolve().stem if paths else "photographs"
+    title = Path(paths[0]).resolve().stem
     place = workspace or Path("runs") / f"{title}-{preset}"
     stages = plan_photographs(photographs, options, structure)
     made = _run(stages, place, workers, scheduler)

@@ -77,6 +77,10 @@ def test_results_are_evaluated_as_they_are(
 ) -> None:
     result = megloc.evaluate(results, truth=scene / "query_gt")
     assert "recall (%)" in str(result) and result.row().recall[0].recall == 1.0
+    pairs = megloc.evaluate(results, truth=scene / "query_gt", thresholds=[(0.05, 5), (9, 9)])
+    assert [str(each.threshold) for each in pairs.row().recall] == ["0.05 m, 5 deg", "9 m, 9 deg"]
+    with pytest.raises(megloc.OptionError, match="'-1, 5' is not METRES,DEGREES"):
+        megloc.evaluate(results, truth=scene / "query_gt", thresholds=[(-1, 5)])
     results.save(tmp_path / "saved")
     again = megloc.evaluate(tmp_path / "saved", truth=scene / "query_gt")
     assert list(again.to_pandas().index) == list(results)
@@ -197,6 +201,8 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     with pytest.raises(megloc.OptionError, match="has its own cameras"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)
+    with pytest.raises(megloc.OptionError, match="photographs are given as files"):
+        megloc.map_photographs([np.zeros((8, 8, 3))])  # type: ignore[list-item]
     with pytest.raises(megloc.DataError, match="nowhere"):
         megloc.open_map(tmp_path / "nowhere").localize(scene / "query")
     with pytest.raises(megloc.OptionError, match="needs a reference model"):

@@ -67,7 +67,7 @@ def evaluate(
     *,
     dataset: str | None = None,
     side_tables: Path | str | None = None,
-    thresholds: Sequence[Threshold] | None = None,
+    thresholds: Sequence[Threshold | tuple[float, float]] | None = None,
     mapping: Path | str | None = None,
     label: str | None = None,
     align: Align = "none",
@@ -88,7 +88,7 @@ def evaluate(
         the side tables.
     side_tables : ``megloc/`` folder of a workspace; by default that of the workspace of ``truth``,
         else of ``estimated``.
-    thresholds : recall thresholds instead of the protocol's.
+    thresholds : recall thresholds (metres, degrees) instead of the protocol's.
     mapping : kapture folder of the map, for MLAD's pairs and for pictures; by default that of the
         workspace of ``estimated``.
     label : name of the result in tables; by default its path.
@@ -96,11 +96,15 @@ def evaluate(
     """
     benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
+    bounds = [
+        each if isinstance(each, Threshold) else Threshold.parse(str(each).strip("()[]"))
+        for each in thresholds or ()
+    ]
     return evaluate_results(
         [estimated],
         truth,
         benchmark,
-        thresholds=thresholds,
+        thresholds=bounds or None,
         mapping=mapping,
         labels=labels,
         align=align,

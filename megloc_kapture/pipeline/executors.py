@@ -133,7 +133,8 @@ def _process_pool(count: int) -> Iterator[Executor]:
         _kill(pool)
         if isinstance(error, BrokenProcessPool):
             raise MeglocError(
-                "a worker process died, perhaps out of memory; try fewer workers (--workers)"
+                "a worker process died: out of memory (try fewer workers, --workers), or a script "
+                'whose code is not below `if __name__ == "__main__":`'
             ) from error
         raise
     finally:
