@@ -22,6 +22,7 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
+from megloc_kapture.io.dataset_tables import keep_unit
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
@@ -100,6 +101,7 @@ class RefineMap(Reading, Choosing, Working):
             refine_map(
                 source, out, options, restrictions=restrictions_beside(source.root), work=work
             )
+            keep_unit(source.root, out)
         for row in report_lines(self.output):
             console.say(row)
 
@@ -152,6 +154,7 @@ class Densify(Reading, Choosing, Working):
             counts = densify_map(
                 source, out, options, restrictions=restrictions_beside(source.root), work=work
             )
+            keep_unit(source.root, out)
             console.say(counts_text(counts))
             if self.fuse is not None:
                 agreement = fitted_to_poses(source, options.max_size_px).agreement

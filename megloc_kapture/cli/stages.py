@@ -31,6 +31,7 @@ from megloc_kapture.cli.common import (
     kapture_map,
 )
 from megloc_kapture.errors import OptionError, check_option, require
+from megloc_kapture.io.dataset_tables import keep_unit
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.kapture_map import restrictions_beside
@@ -172,6 +173,7 @@ class Triangulate(Reading, Choosing, Working):
                 pairs=pairs,
                 num_threads=work.num_threads,
             )
+            keep_unit(mapping.root, out)
         console.say(counts_text(counts))
 
 
@@ -435,6 +437,7 @@ class Preprocess(Computing, Working):
         sequences = [KaptureFolder(path) for path in existing(self.sequence)]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             counts = preprocess_images(source, out, options, sequences=sequences, work=work)
+            keep_unit(source.root, out)
         console.say(f"{counts['images']} images, {counts['images_changed']} of them changed")
         for name, share in counts.items():
             if name.startswith("masked_"):

@@ -293,6 +293,12 @@ def unit_of(root: Path | str) -> str:
     return METRES if tables is None else read_world(tables).unit
 
 
+def keep_unit(source: Path, output: Path) -> None:
+    """Write the unit of ``source`` into the output of a command, which may lie elsewhere."""
+    if (unit := unit_of(source)) != METRES:
+        write_unit(output, unit)
+
+
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
     path = Path(folder) / RELOCALIZATION_FILE
     return read_records(path, RelocalizationPair, missing_ok=True)

@@ -17,6 +17,7 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.io.dataset_tables import unit_of
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.kapture_map import KaptureMap
@@ -72,6 +73,10 @@ def test_positions_in_a_map_of_unknown_scale_are_in_units_of_the_map(
     done = megloc("evaluate", "-i", localized, *truth, "--align", "sim3")
     assert "4 of 4 poses" in done.out and "100.0" in done.out
     assert json.loads(map_overview(KaptureMap.open(workspace / "map")))["unit"] == "units"
+    # maps that are made of it elsewhere keep its unit
+    for command in ("refine-map", "preprocess"):
+        done = megloc(command, "-i", workspace / "map", "-o", tmp_path / command)
+        assert done.status == 0 and unit_of(tmp_path / command) == "units"
 
 
 def test_a_given_camera_is_kept_fixed(megloc: Any, unposed: Path, tmp_path: Path) -> None:
