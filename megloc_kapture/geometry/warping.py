@@ -23,6 +23,7 @@ from megloc_kapture.geometry.cameras import (
     px_from_cam,
     scaled_camera,
 )
+from megloc_kapture.plugins import DepthView, RankingScene
 from megloc_kapture.values import Camera, RigidTransform
 
 _NEAR_M = 0.02  # surfaces nearer to the camera of the view are clipped
@@ -40,19 +41,27 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class WarpSource:
-    """A reference image uint8 (H, W, 3) with depth map, pose and optional mask (H, W), True = use.
+class PosedImage:
+    """A map image uint8 (H, W, 3) with its pose, and optional depth and mask (H, W), True = use.
 
-    ``depth_m`` is along the axis of ``depth_camera``; 0, negative or NaN where unknown.
+    The depth map may be from another camera.
     """
 
     image: NDArray[np.uint8]
     camera: Camera
     cam_from_world: RigidTransform
-    depth_m: NDArray[np.float32]
-    depth_camera: Camera
-    image_from_depth: RigidTransform = RigidTransform.identity()
+    depth: DepthView | None = None
     mask: NDArray[np.bool_] | None = None
+    name: str = ""
+
+
+def image_with_depth(name: str, scene: RankingScene) -> PosedImage | None:
+    """Return a map image; None without depth."""
+    depth = scene.map_depth(name)
+    if depth is None:
+        return None
+    image, camera = scene.map_image(name), scene.map_camera(name)
+    return PosedImage(image, camera, scene.map_pose(name), depth, scene.map_mask(name), name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +80,13 @@ class WarpedView:
 
 
 def warp_to_view(
-    sources: Sequence[WarpSource],
+    sources: Sequence[PosedImage],
     camera: Camera,
     cam_from_world: RigidTransform,
     *,
     scale: float = 1.0,
 ) -> WarpedView:
-    """Warp reference images into a view of any camera model, rendered at ``scale`` times its size.
+    """Warp images with depth into a view of any camera model, rendered at ``scale`` times its size.
 
     Of the references that see a pixel's surface, the one with the smallest sum of viewing angle and
     loss of resolution gives the colour; ties go to the first.
@@ -110,15 +119,16 @@ def warp_to_view(
 
 
 def _seen_depth(
-    source: WarpSource, camera: Camera, cam_from_world: RigidTransform
+    source: PosedImage, camera: Camera, cam_from_world: RigidTransform
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the depth (H, W) of a reference's surface in a view, and a mask of front faces."""
     from megloc_kapture.geometry.projection import draw_depth_surface
 
+    assert source.depth is not None
     return draw_depth_surface(
-        source.depth_m,
-        pixel_rays(source.depth_camera),
-        cam_from_world @ source.cam_from_world.inverse() @ source.image_from_depth,
+        source.depth.depth_m,
+        pixel_rays(source.depth.camera),
+        cam_from_world @ source.cam_from_world.inverse() @ source.depth.image_from_depth,
         camera,
         max_jump=_MAX_JUMP,
         near_m=_NEAR_M,
@@ -137,14 +147,15 @@ def _field(camera: Camera) -> float:
 
 
 def _look_up(
-    source: WarpSource, points: Floats, focal: float
+    source: PosedImage, points: Floats, focal: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return colours uint8 (N, 3) of world points in a reference, and a visibility mask (N,)."""
     image, mask, shrink = _at_resolution(source, focal)
     in_camera = source.cam_from_world.apply(points)
     px = px_from_cam(source.camera, in_camera)
     usable = np.asarray(np.isfinite(px).all(axis=1))
-    if np.linalg.norm(source.image_from_depth.translation) > _SAME_CENTRE_M:
+    assert source.depth is not None
+    if np.linalg.norm(source.depth.image_from_depth.translation) > _SAME_CENTRE_M:
         usable &= _not_hidden(source, in_camera, px)
     # in OpenCV, the centre of the first pixel is (0, 0)
     in_array = np.where(usable[:, None], px, -1e4) * shrink - 0.5
@@ -170,7 +181,7 @@ def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) 
 
 
 def _at_resolution(
-    source: WarpSource, focal: float
+    source: PosedImage, focal: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None, Floats]:
     """Return image and mask, reduced if their resolution exceeds the view's, and the scale (2,)."""
     height, width = source.image.shape[:2]
@@ -185,7 +196,7 @@ def _at_resolution(
     return image, mask, np.array(size) / (width, height)
 
 
-def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
+def _not_hidden(source: PosedImage, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of the points, seen by the depth sensor, that the image also sees."""
     surface, _ = _seen_depth(source, source.camera, source.cam_from_world)
     inside = in_image(source.camera, px)

@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
+from megloc_kapture.geometry.warping import PosedImage, WarpedView, image_with_depth, warp_to_view
 from megloc_kapture.plugin_loading import Placement, load_chosen, weights_of
 from megloc_kapture.plugins import (
     IMAGE_DISTANCES,
@@ -190,7 +190,7 @@ class PerceptualRanker:
         otherwise = DistinctiveInliers().score(hypotheses, scene)
         inliers = [sum(int(v.inliers.sum()) for v in each.views) for each in hypotheses]
         enough = self.options.min_inlier_share * max(inliers)
-        read = cache(scene.query_image), cache(partial(warp_source, scene=scene))
+        read = cache(scene.query_image), cache(partial(image_with_depth, scene=scene))
         compared = [
             self._views(each, scene, *read) if count >= enough else None
             for each, count in zip(hypotheses, inliers, strict=True)
@@ -221,12 +221,12 @@ class PerceptualRanker:
         hypothesis: PoseHypothesis,
         scene: RankingScene,
         query_image: Callable[[str], NDArray[np.uint8]],
-        source_of: Callable[[str], WarpSource | None],
+        source_of: Callable[[str], PosedImage | None],
     ) -> list[_Compared]:
         views, options, images = [], self.options, hypothesis.images
         for view in hypothesis.views:
             place = view.camera, view.cam_from_world
-            warped = aligned_view(*place, images, scene, options, source_of=source_of)
+            warped = aligned_view(*place, images, scene, options, source_of)
             height, width = warped.valid.shape
             mask, valid = scene.query_mask(view.name), warped.valid
             if mask is not None:
@@ -270,38 +270,20 @@ class PerceptualRanker:
         return float(np.average(np.array(distances)[known], weights=counts[known]))
 
 
-def warp_source(name: str, scene: RankingScene) -> WarpSource | None:
-    depth = scene.map_depth(name)
-    if depth is None:
-        return None
-    return WarpSource(
-        image=scene.map_image(name),
-        camera=scene.map_camera(name),
-        cam_from_world=scene.map_pose(name),
-        depth_m=depth.depth_m,
-        depth_camera=depth.camera,
-        image_from_depth=depth.image_from_depth,
-        mask=scene.map_mask(name),
-    )
-
-
 def aligned_view(
     camera: Camera,
     cam_from_world: RigidTransform,
     images: Sequence[str],
     scene: RankingScene,
-    options: PerceptualOptions | None = None,
-    *,
-    source_of: Callable[[str], WarpSource | None] | None = None,
+    options: PerceptualOptions,
+    source_of: Callable[[str], PosedImage | None],
 ) -> WarpedView:
     """Warp the map images with depth that are nearest to a pose into its view, at reduced size."""
-    options = options or PerceptualOptions()
-    read = source_of or (lambda name: warp_source(name, scene))
-    sources: list[WarpSource] = []
+    sources: list[PosedImage] = []
     for name in _nearest_first(images, cam_from_world, scene):
         if len(sources) == options.references:
             break
-        if (source := read(name)) is not None:
+        if (source := source_of(name)) is not None:
             sources.append(source)
     scale = min(1.0, options.long_side / max(camera.width, camera.height))
     return warp_to_view(sources, camera, cam_from_world, scale=scale)

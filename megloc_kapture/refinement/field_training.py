@@ -21,12 +21,12 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.nets.radiance import NerfW, Rays, nerf_w_loss
 from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device, state_bytes
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
     FieldModule,
-    FieldView,
     Floats,
     Kind,
     Lights,
@@ -81,7 +81,7 @@ class FieldTrainer:
 
     def __init__(
         self,
-        views: Sequence[FieldView],
+        views: Sequence[PosedImage],
         options: FieldTrainingOptions,
         module: FieldModule | None = None,
     ) -> None:
@@ -208,7 +208,7 @@ def _groups(module: FieldModule) -> list[dict[str, object]]:
 
 
 class _Pixels:
-    def __init__(self, views: Sequence[FieldView], max_side_px: int) -> None:
+    def __init__(self, views: Sequence[PosedImage], max_side_px: int) -> None:
         pixels = [pixels_of(view, max_side_px) for view in views]
         self._cameras = list(dict.fromkeys(camera for camera, *_ in pixels))
         self._camera_of = np.array([self._cameras.index(camera) for camera, *_ in pixels])

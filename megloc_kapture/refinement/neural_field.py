@@ -21,9 +21,8 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import pixel_rays, reduced_camera
-from megloc_kapture.geometry.warping import WarpSource, warp_to_view
+from megloc_kapture.geometry.warping import PosedImage, warp_to_view
 from megloc_kapture.nets.radiance import NerfW, Rays, Rendered, TriPlane
-from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Kind = Literal["triplane", "nerfw"]
@@ -34,24 +33,6 @@ Floats = NDArray[np.float32]
 _CHUNK, _CPU_CHUNK = 4096, 512
 # fit of an appearance embedding: Adam's rate, steps, rays per step, and rays to draw from
 _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
-
-
-@dataclass(frozen=True, eq=False)
-class FieldView:
-    """A posed image, like :class:`~.references.RenderingReference`, with optional depth."""
-
-    name: str
-    image: NDArray[np.uint8]
-    camera: Camera
-    cam_from_world: RigidTransform
-    mask: NDArray[np.bool_] | None = None
-    depth: DepthView | None = None
-
-    def as_source(self) -> WarpSource:
-        assert self.depth is not None
-        depth, pose = self.depth, self.cam_from_world
-        measured = depth.depth_m, depth.camera, depth.image_from_depth
-        return WarpSource(self.image, self.camera, pose, *measured, self.mask)
 
 
 class FieldFrame(Options):
@@ -178,7 +159,7 @@ class NeuralField:
             optimizer.step()
         return fitted.detach()
 
-    def fitted_appearance(self, view: FieldView, max_side_px: int) -> torch.Tensor | None:
+    def fitted_appearance(self, view: PosedImage, max_side_px: int) -> torch.Tensor | None:
         camera, rgb, usable, _ = pixels_of(view, max_side_px)
         rows = torch.from_numpy(np.flatnonzero(usable)).to(self.device)
         if not len(rows):
@@ -186,7 +167,7 @@ class NeuralField:
         rays = select(self.rays(camera, view.cam_from_world), rows)
         return self.fit_appearance(rays, self._tensor(rgb.astype(np.float32) / 255)[rows])
 
-    def held_out_psnr(self, view: FieldView) -> float:
+    def held_out_psnr(self, view: PosedImage) -> float:
         """Return the PSNR in dB on an image's right half, with the appearance of its left half.
 
         NaN if a half has no usable pixel.
@@ -221,7 +202,7 @@ def select(rays: Rays, rows: slice | torch.Tensor) -> Rays:
 
 
 def pixels_of(
-    view: FieldView, max_side_px: int
+    view: PosedImage, max_side_px: int
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.bool_], Floats | None]:
     """Return a reduced view: camera, colours (N, 3), usable pixels (N,) and depths (N,)."""
     if view.image.shape != (view.camera.height, view.camera.width, 3):
@@ -238,16 +219,14 @@ def pixels_of(
         usable = usable & (np.asarray(mask).ravel() > 0)
     depth = None
     if view.depth is not None:
-        source = replace(view, mask=None).as_source()
-        warped = warp_to_view(
-            [source], view.camera, view.cam_from_world, scale=camera.width / view.camera.width
-        )
+        scale, unmasked = camera.width / view.camera.width, replace(view, mask=None)
+        warped = warp_to_view([unmasked], view.camera, view.cam_from_world, scale=scale)
         depth = warped.depth_m.ravel()
     return camera, image.reshape(-1, 3), usable, depth
 
 
-def reduced_view(view: FieldView, max_side_px: int) -> FieldView:
+def reduced_view(view: PosedImage, max_side_px: int) -> PosedImage:
     camera, rgb, usable, _ = pixels_of(view, max_side_px)
     shape = camera.height, camera.width
     image, mask = rgb.reshape(*shape, 3), usable.reshape(shape)
-    return FieldView(view.name, image, camera, view.cam_from_world, mask)
+    return PosedImage(image, camera, view.cam_from_world, mask=mask, name=view.name)

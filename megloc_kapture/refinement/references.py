@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import in_image, project
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
-from megloc_kapture.plugins import DepthView, RankingScene
+from megloc_kapture.geometry.warping import PosedImage, image_with_depth
+from megloc_kapture.plugins import RankingScene
 from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE, RenderingOptions
 from megloc_kapture.refinement.pyramid import (
     DepthPoints,
@@ -90,31 +91,12 @@ class RenderingQuery:
     mask: NDArray[np.bool_] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class RenderingReference:
-    """A map image to warp into the query, with a depth map that may be from another camera."""
-
-    image: NDArray[np.uint8]
-    camera: Camera
-    cam_from_world: RigidTransform
-    depth: DepthView
-    mask: NDArray[np.bool_] | None = None
-
-
-def reference_of(name: str, scene: RankingScene) -> RenderingReference | None:
-    """Return a map image as a reference; None without depth."""
-    depth = scene.map_depth(name)
-    if depth is None:
-        return None
-    image, camera = scene.map_image(name), scene.map_camera(name)
-    return RenderingReference(image, camera, scene.map_pose(name), depth, scene.map_mask(name))
-
-
-def lifted(reference: RenderingReference) -> DepthPoints:
+def lifted(reference: PosedImage) -> DepthPoints:
+    assert reference.depth is not None
     return lift_points(reference.camera, reference.cam_from_world, reference.depth)
 
 
-def pyramid_of(view: RenderingQuery | RenderingReference, options: RenderingOptions) -> list[Level]:
+def pyramid_of(view: RenderingQuery | PosedImage, options: RenderingOptions) -> list[Level]:
     """Build the pyramid of an image, finest first."""
     image, camera = view.image, view.camera
     if image.shape != (camera.height, camera.width, 3):
@@ -210,8 +192,8 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
 
 
 def references_elsewhere(
-    view: RenderingReference, images: ReferenceImages, scene: RankingScene
-) -> list[RenderingReference]:
+    view: PosedImage, images: ReferenceImages, scene: RankingScene
+) -> list[PosedImage]:
     """Return overlapping map images from other viewpoints, largest overlap first."""
     surface = lifted(view)
     points = surface.points[:: max(1, len(surface.points) // _ASKED_POINTS)]
@@ -222,7 +204,7 @@ def references_elsewhere(
         view.cam_from_world, (), max_references=_NEAREST, min_distance_m=_MIN_PARALLAX * distance_m
     )
     best = sorted(neighbours, key=lambda name: -_share_inside(points, name, scene))[:_BEST]
-    candidates = [each for name in best if (each := reference_of(name, scene)) is not None]
+    candidates = [each for name in best if (each := image_with_depth(name, scene)) is not None]
     shared = [_share_seen(view, surface, each) for each in candidates]
     order = np.argsort(-np.array(shared), kind="stable")
     return [candidates[k] for k in order if shared[k] >= _MIN_SHARED]
@@ -234,7 +216,7 @@ def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -
     return float(in_image(camera, project(camera, pose, ahead)).sum() / len(points))
 
 
-def _share_seen(view: RenderingReference, surface: DepthPoints, other: RenderingReference) -> float:
+def _share_seen(view: PosedImage, surface: DepthPoints, other: PosedImage) -> float:
     points = lifted(other)
     visible = visibility([surface, points], view.camera, view.cam_from_world).seen[1]
     unoccluded = DepthPoints(points.points[visible], points.px[visible])

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.geometry.warping import PosedImage, image_with_depth
 from megloc_kapture.plugins import PoseRefinement, RankingScene
 from megloc_kapture.refinement.acceptance import (
     Candidate,
@@ -33,10 +34,8 @@ from megloc_kapture.refinement.references import (
     Displacement,
     ReferenceImages,
     RenderingQuery,
-    RenderingReference,
     lifted,
     pyramid_of,
-    reference_of,
     references_elsewhere,
 )
 from megloc_kapture.values import Camera, RigidTransform
@@ -53,7 +52,7 @@ _CLEAR = 4.0
 
 def refine_by_rendering(
     query: RenderingQuery,
-    references: Sequence[RenderingReference],
+    references: Sequence[PosedImage],
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> PoseRefinement:
@@ -69,7 +68,7 @@ def refine_by_rendering(
 
 def judge_by_rendering(
     query: RenderingQuery,
-    references: Sequence[RenderingReference],
+    references: Sequence[PosedImage],
     start: RigidTransform,
     refined: RigidTransform,
     options: RenderingOptions,
@@ -85,7 +84,7 @@ def judge_by_rendering(
 
 def displacement_by_rendering(
     query: RenderingQuery,
-    references: Sequence[RenderingReference],
+    references: Sequence[PosedImage],
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> Displacement | None:
@@ -113,7 +112,7 @@ class _Refining:
     def __init__(
         self,
         query: RenderingQuery,
-        references: Sequence[RenderingReference],
+        references: Sequence[PosedImage],
         options: RenderingOptions,
     ) -> None:
         self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
@@ -224,7 +223,7 @@ class Rendering:
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
-        view = reference_of(image, scene)
+        view = image_with_depth(image, scene)
         if view is None:
             return None
         references = references_elsewhere(view, images, scene)[: self.options.max_references]
@@ -242,11 +241,11 @@ class Rendering:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        used: list[RenderingReference] = []
+        used: list[PosedImage] = []
         for name in references:
             if len(used) == self.options.max_references:
                 break
-            if (reference := reference_of(name, scene)) is not None:
+            if (reference := image_with_depth(name, scene)) is not None:
                 used.append(reference)
         if not used:
             return PoseRefinement(cam_from_world, "no reference image has depth")

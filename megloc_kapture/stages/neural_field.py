@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from megloc_kapture.errors import check_option, require
 from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.io.files import (
     read_content,
     read_json_model,
@@ -50,13 +51,12 @@ from megloc_kapture.refinement.field_training import FieldTrainer, FieldTraining
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
     FieldRendering,
-    FieldView,
     Kind,
     NeuralField,
     build_field,
     light_rows,
 )
-from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
+from megloc_kapture.refinement.references import RenderingQuery
 from megloc_kapture.refinement.rendering import judge_by_rendering
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import HERE, Work
@@ -118,17 +118,17 @@ def train_field_of_map(
     return psnr
 
 
-def views_of(mapping: KaptureFolder) -> list[FieldView]:
+def views_of(mapping: KaptureFolder) -> list[PosedImage]:
     """Return the posed images of a map, sorted by name, with masks and depth."""
     scene = KaptureScene(mapping)
     return [
-        FieldView(
-            name,
+        PosedImage(
             scene.map_image(name),
             scene.map_camera(name),
             pose,
-            scene.map_mask(name),
             scene.map_depth(name),
+            scene.map_mask(name),
+            name,
         )
         for name, pose in mapping.read().poses().items()
     ]
@@ -335,7 +335,7 @@ class FieldRefiner:
         side = self.options.max_side_px
 
         def light_at(pose: RigidTransform) -> torch.Tensor | None:
-            return field.fitted_appearance(FieldView(query, image, camera, pose, used), side)
+            return field.fitted_appearance(PosedImage(image, camera, pose, mask=used), side)
 
         light = light_at(cam_from_world)
         first = field.render(camera, cam_from_world, appearance=light, max_side_px=side)
@@ -354,7 +354,7 @@ class FieldRefiner:
         for _ in range(_ALIGNMENTS):
             shown = field.render(camera, pose, appearance=light, max_side_px=side)
             depth = DepthView(shown.camera, shown.depth_m, RigidTransform.identity())
-            reference = RenderingReference(shown.image, shown.camera, pose, depth)
+            reference = PosedImage(shown.image, shown.camera, pose, depth)
             judged = judge_by_rendering(
                 seen, [reference], cam_from_world, pose, options, judged=~fitted
             )

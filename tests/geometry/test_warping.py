@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays, project, scaled_camera
 from megloc_kapture.geometry.projection import draw_depth_surface
-from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
+from megloc_kapture.geometry.warping import PosedImage, WarpedView, warp_to_view
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERAS = [
@@ -62,19 +63,21 @@ def on_plane(
     depth_camera: Camera | None = None,
     image_from_depth: RigidTransform = STILL,
     mask: NDArray[np.bool_] | None = None,
-) -> WarpSource:
+) -> PosedImage:
     """Return the image of a painted plane, with depth of a sensor next to the camera."""
     depth_camera = depth_camera or camera
     depth_from_world = image_from_depth.inverse() @ cam_from_world
     depth = plane_depth(depth_camera, depth_from_world, plane)
     seen = points_of(camera, cam_from_world, plane_depth(camera, cam_from_world, plane))
-    return WarpSource(
+    return PosedImage(
         image=paint(seen).reshape(camera.height, camera.width, 3),
         camera=camera,
         cam_from_world=cam_from_world,
-        depth_m=depth.reshape(depth_camera.height, depth_camera.width).astype(np.float32),
-        depth_camera=depth_camera,
-        image_from_depth=image_from_depth,
+        depth=DepthView(
+            depth_camera,
+            depth.reshape(depth_camera.height, depth_camera.width).astype(np.float32),
+            image_from_depth,
+        ),
         mask=mask,
     )
 
@@ -123,7 +126,9 @@ def test_depth_of_a_separate_camera() -> None:
     assert valid.mean() > 0.6
     assert_painted(view, points, valid)
     # without the offset the depth is wrong
-    forgotten = warp_to_view([replace(right, image_from_depth=STILL)], CAMERAS[1], there)
+    assert right.depth is not None
+    unmoved = replace(right, depth=replace(right.depth, image_from_depth=STILL))
+    forgotten = warp_to_view([unmoved], CAMERAS[1], there)
     truth = plane_depth(CAMERAS[1], there, WALL)
     np.testing.assert_allclose(view.depth_m.ravel()[valid], truth[valid], rtol=2e-4)
     both = valid & forgotten.valid.ravel()
@@ -165,11 +170,12 @@ def board(camera: Camera, pose: RigidTransform) -> tuple[NDArray[np.float64], ND
     return np.where(on_board, front, wall), on_board
 
 
-def board_source(pose: RigidTransform) -> WarpSource:
+def board_source(pose: RigidTransform) -> PosedImage:
     camera = CAMERAS[1]
     depth, _ = board(camera, pose)
     image = paint(points_of(camera, pose, depth)).reshape(60, 80, 3)
-    return WarpSource(image, camera, pose, depth.reshape(60, 80).astype(np.float32), camera)
+    measured = DepthView(camera, depth.reshape(60, 80).astype(np.float32), STILL)
+    return PosedImage(image, camera, pose, measured)
 
 
 ASIDE = turned(0.0, 0.0, (-0.6, 0.0, 0.0))
@@ -226,7 +232,8 @@ def test_masked_pixels_and_missing_depth_are_invalid() -> None:
     np.testing.assert_array_equal(warp_to_view([masked], CAMERAS[1], STILL).valid, mask)
     for nothing in (0.0, -1.0, np.nan, np.inf):
         source = on_plane(CAMERAS[1], STILL, WALL)
-        source.depth_m[10:20, 40:60] = nothing
+        assert source.depth is not None
+        source.depth.depth_m[10:20, 40:60] = nothing
         view = warp_to_view([source], CAMERAS[1], STILL)
         assert not view.valid[11:19, 41:59].any()
         assert view.valid[:9].all()
@@ -237,7 +244,7 @@ def test_points_that_only_the_depth_camera_sees_are_hidden() -> None:
     # the depth sensor sees the wall behind the board, the camera does not
     source = board_source(STILL)
     depth = board(CAMERAS[1], ASIDE)[0].reshape(60, 80).astype(np.float32)
-    beside = replace(source, depth_m=depth, image_from_depth=ASIDE.inverse())
+    beside = replace(source, depth=DepthView(source.camera, depth, ASIDE.inverse()))
     check_board(warp_to_view([beside], CAMERAS[1], ASIDE))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scenes import Scene
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.geometry.warping import WarpedView, image_with_depth
 from megloc_kapture.localization.ranking import (
     DistinctiveInliers,
     InlierCount,
@@ -194,16 +195,20 @@ def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
     assert plain[2] > 0
 
 
+def view_at(pose: RigidTransform, images: list[str], scene: Scene, **options: int) -> WarpedView:
+    source_of = partial(image_with_depth, scene=scene)
+    return aligned_view(CAMERA, pose, images, scene, PerceptualOptions(**options), source_of)
+
+
 def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
-    one = PerceptualOptions(references=1)
     near = standing(RIGHT, 0.45)
-    aligned_view(CAMERA, near, ["2_0.jpg", "2_1.jpg"], scene, one)
+    view_at(near, ["2_0.jpg", "2_1.jpg"], scene, references=1)
     assert scene.asked == ["2_1.jpg"]
     scene.asked = []
     del scene.depths["2_1.jpg"]
-    aligned_view(CAMERA, near, ["2_0.jpg", "2_1.jpg"], scene, one)
+    view_at(near, ["2_0.jpg", "2_1.jpg"], scene, references=1)
     assert scene.asked == ["2_0.jpg"]
-    assert not aligned_view(CAMERA, near, [], scene).valid.any()
+    assert not view_at(near, [], scene).valid.any()
 
 
 def test_references_from_different_positions_come_first() -> None:
@@ -211,12 +216,11 @@ def test_references_from_different_positions_come_first() -> None:
     numbers = {0: -0.5, 1: -0.499, 2: -0.498, 3: -0.497, 9: 0.9}
     room = scene_of({f"2_{number}.jpg": standing(RIGHT, x, 0.5) for number, x in numbers.items()})
     film = [f"2_{number}.jpg" for number in range(4)]
-    two = PerceptualOptions(references=2)
-    view = aligned_view(CAMERA, standing(RIGHT), [*film, "2_9.jpg"], room, two)
+    view = view_at(standing(RIGHT), [*film, "2_9.jpg"], room, references=2)
     assert room.asked == ["2_3.jpg", "2_9.jpg"]
-    of_film = aligned_view(CAMERA, standing(RIGHT), film, room, two)
+    of_film = view_at(standing(RIGHT), film, room, references=2)
     assert view.valid.mean() > of_film.valid.mean() + 0.1
     # all are used if the number allows
     room.asked = []
-    aligned_view(CAMERA, standing(RIGHT), [*film, "2_9.jpg"], room)
+    view_at(standing(RIGHT), [*film, "2_9.jpg"], room)
     assert room.asked == ["2_3.jpg", "2_9.jpg", "2_2.jpg", "2_1.jpg", "2_0.jpg"]

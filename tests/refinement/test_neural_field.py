@@ -18,13 +18,14 @@ torch = pytest.importorskip("torch")
 import room  # noqa: E402
 
 from megloc_kapture.errors import DataError  # noqa: E402
+from megloc_kapture.geometry.warping import PosedImage  # noqa: E402
 from megloc_kapture.nets import radiance  # noqa: E402
 from megloc_kapture.nets.radiance import TriPlane  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugins import DepthView  # noqa: E402
 from megloc_kapture.refinement import field_training  # noqa: E402
 from megloc_kapture.refinement.field_training import FieldTrainer, FieldTrainingOptions  # noqa: E402
-from megloc_kapture.refinement.neural_field import FieldView, NeuralField, light_rows, pixels_of  # noqa: E402
+from megloc_kapture.refinement.neural_field import NeuralField, light_rows, pixels_of  # noqa: E402
 from megloc_kapture.values import Camera, RigidTransform  # noqa: E402
 
 SMALL = Camera("PINHOLE", 32, 24, (22.0, 22.0, 16.0, 12.0))
@@ -33,7 +34,7 @@ IDENTITY = RigidTransform.identity()
 
 
 def train_field(
-    given: Sequence[FieldView],
+    given: Sequence[PosedImage],
     options: FieldTrainingOptions,
     *,
     module: TriPlane | None = None,
@@ -58,7 +59,7 @@ def coarse_planes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 def views(
     count: int, camera: Camera = SMALL, *, seed: int = 1, depth: bool = True, moving: bool = False
-) -> list[FieldView]:
+) -> list[PosedImage]:
     result = []
     for number, pose in enumerate(room.poses(count, seed)):
         mover = number if moving and number % 5 < 3 else None
@@ -66,11 +67,11 @@ def views(
         # depth of the empty room, as if measured at another time
         alone = room.render(pose, camera=camera).depth_m
         known = DepthView(camera, alone, IDENTITY) if depth else None
-        result.append(FieldView(f"{number:03}.png", seen.image, camera, pose, None, known))
+        result.append(PosedImage(seen.image, camera, pose, known, name=f"{number:03}.png"))
     return result
 
 
-def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
+def depth_error(field: NeuralField, tests: list[PosedImage]) -> float:
     """Return the median relative error of rendered depths."""
     errors = []
     for view in tests:
@@ -177,9 +178,9 @@ def test_masked_pixels_are_ignored() -> None:
     for view in plain:
         image = view.image.copy()
         image[~mask] = 255
-        arguments = (view.camera, view.cam_from_world, mask, view.depth)
-        masked.append(FieldView(view.name, view.image, *arguments))
-        spoiled.append(FieldView(view.name, image, *arguments))
+        arguments = (view.camera, view.cam_from_world, view.depth, mask, view.name)
+        masked.append(PosedImage(view.image, *arguments))
+        spoiled.append(PosedImage(image, *arguments))
     first, second, whole = (
         train_field(given, QUICK.model_copy(update={"steps": 2}))[0].module.state_dict()
         for given in (masked, spoiled, plain)
@@ -197,9 +198,7 @@ def test_depth_of_another_camera_is_transformed() -> None:
         assert view.depth is not None
         seen = room.render(shift.inverse() @ view.cam_from_world, camera=finer)
         depth = DepthView(finer, seen.depth_m, shift)
-        moved.append(
-            FieldView(view.name, view.image, view.camera, view.cam_from_world, None, depth)
-        )
+        moved.append(replace(view, depth=depth))
     for view, other in zip(plain, moved, strict=True):
         direct, brought = pixels_of(view, 32)[3], pixels_of(other, 32)[3]
         assert direct is not None and brought is not None
@@ -213,7 +212,7 @@ def test_invalid_training_is_refused() -> None:
     with pytest.raises(DataError, match="too few"):
         train_field(few, QUICK)
     (view,) = few
-    wrong = FieldView(view.name, view.image[:-1], view.camera, view.cam_from_world)
+    wrong = replace(view, image=view.image[:-1])
     with pytest.raises(DataError, match=r"000\.png: \(23, 32, 3\) does not fit .* 32x24"):
         train_field([wrong, wrong], QUICK)
     hidden = replace(view, mask=np.zeros((24, 32), bool))

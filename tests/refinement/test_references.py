@@ -15,6 +15,7 @@ from poses import displaced
 from scenes import Scene
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE, RenderingOptions
 from megloc_kapture.refinement.references import (
@@ -25,7 +26,6 @@ from megloc_kapture.refinement.references import (
     Displacement,
     HoldsOut,
     ReferenceImages,
-    RenderingReference,
     judge_consistency,
     pyramid_of,
     references_elsewhere,
@@ -35,16 +35,16 @@ from megloc_kapture.refinement.rendering import Rendering
 from megloc_kapture.values import Camera, RigidTransform
 
 HERE = RigidTransform.identity()
-Map = Mapping[str, RenderingReference]
+Map = Mapping[str, PosedImage]
 
 CAMERA = Camera("PINHOLE", 160, 120, (180.0, 181.8, 80.0, 60.0))
 SLOW = pytest.mark.slow
 QUICK = RenderingOptions(max_references=3)
 
 
-def view(cam_from_world: RigidTransform) -> RenderingReference:
+def view(cam_from_world: RigidTransform) -> PosedImage:
     depth = DepthView(CAMERA, depth_m(cam_from_world, CAMERA), HERE)
-    return RenderingReference(render(cam_from_world, CAMERA), CAMERA, cam_from_world, depth)
+    return PosedImage(render(cam_from_world, CAMERA), CAMERA, cam_from_world, depth)
 
 
 POSES = [
@@ -82,7 +82,7 @@ def verdict(images: Map) -> Consistency:
     )
 
 
-def changed(images: Map, change: Callable[[int, RenderingReference], dict[str, Any]]) -> Map:
+def changed(images: Map, change: Callable[[int, PosedImage], dict[str, Any]]) -> Map:
     """Replace fields of every image; ``change`` gets its number."""
     return {n: replace(each, **change(k, each)) for k, (n, each) in enumerate(images.items())}
 

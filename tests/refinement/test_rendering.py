@@ -15,9 +15,10 @@ from poses import displaced, pose_errors
 from scenes import Scene
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.acceptance import RenderingOptions
-from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
+from megloc_kapture.refinement.references import RenderingQuery
 from megloc_kapture.refinement.rendering import Rendering, _Refining, refine_by_rendering
 from megloc_kapture.values import RigidTransform
 
@@ -28,7 +29,7 @@ HERE = RigidTransform.identity()
 class Case:
     query: RenderingQuery
     truth: RigidTransform
-    references: tuple[RenderingReference, ...]
+    references: tuple[PosedImage, ...]
 
 
 def at_night(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -37,8 +38,8 @@ def at_night(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.clip(0.2 * image * [1.1, 0.92, 0.75] + noise, 0, 255).astype(np.uint8)
 
 
-def reference(pose: RigidTransform) -> RenderingReference:
-    return RenderingReference(render(pose), CAMERA, pose, DepthView(CAMERA, depth_m(pose), HERE))
+def reference(pose: RigidTransform) -> PosedImage:
+    return PosedImage(render(pose), CAMERA, pose, DepthView(CAMERA, depth_m(pose), HERE))
 
 
 @pytest.fixture(scope="module")

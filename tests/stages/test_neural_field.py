@@ -13,6 +13,7 @@ from poses import displaced
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.poses import movement
+from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_REFINERS, DepthView, PoseRefinement
 from megloc_kapture.values import Camera, RigidTransform
@@ -21,7 +22,7 @@ pytest.importorskip("torch")
 
 from megloc_kapture.refinement.acceptance import RenderingOptions  # noqa: E402
 from megloc_kapture.refinement.neural_field import FieldRendering  # noqa: E402
-from megloc_kapture.refinement.references import RenderingQuery, RenderingReference  # noqa: E402
+from megloc_kapture.refinement.references import RenderingQuery  # noqa: E402
 from megloc_kapture.refinement.rendering import judge_by_rendering  # noqa: E402
 from megloc_kapture.stages import neural_field  # noqa: E402
 
@@ -116,7 +117,7 @@ def test_appearance_and_acceptance_use_different_halves_of_the_image(
     half = fitted[0]
     assert judged and all((one == ~half).all() for one in judged)
     assert whole.accepted and half.mean() == pytest.approx(0.5, abs=0.05)
-    reference = RenderingReference(image, LARGER, truth, DepthView(LARGER, depth, IDENTITY))
+    reference = PosedImage(image, LARGER, truth, DepthView(LARGER, depth, IDENTITY))
     options = RenderingOptions(levels=1)
     noise = np.random.default_rng(0).integers(0, 255, image.shape, np.uint8)
     query = RenderingQuery(np.where(half[..., None], noise, image), LARGER)
