@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -93,30 +92,32 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
             stacked = torch.from_numpy(np.stack(levels))[:, None].to(device)
             with inference(device, self.options.half_precision):
                 maps = net(stacked)
-            for k, maps_of_image in zip(usable, maps, strict=True):
-                levels_of[k].append(self._selected(maps_of_image, images[0].shape))
+            for k, scores, features in zip(usable, *maps, strict=True):
+                levels_of[k].append(self._selected(scores, features, images[0].shape))
         return [
             self._best_of_levels(each or [_NOTHING], mask)
             for each, mask in zip(levels_of, masks, strict=True)
         ]
 
-    def _selected(self, maps: AslFeatMaps, full_size: Sequence[int]) -> Level:
+    def _selected(
+        self, score_map: torch.Tensor, features: torch.Tensor, full_size: Sequence[int]
+    ) -> Level:
         options = self.options
-        with inference(maps.scores.device):
+        with inference(score_map.device):
             candidates = select_pixels(
-                suppress_non_maxima(maps.scores, options.nms_radius, rounds=0),
+                suppress_non_maxima(score_map, options.nms_radius, rounds=0),
                 threshold=options.threshold,
                 border=_BORDER_PX,
             )
-            kept = on_no_edge(maps.scores, candidates.xy, options.max_edge_ratio)
-            xy = parabola_peak(maps.scores, candidates.xy[kept])
+            kept = on_no_edge(score_map, candidates.xy, options.max_edge_ratio)
+            xy = parabola_peak(score_map, candidates.xy[kept])
             scores = candidates.scores[kept]
-            coarse = maps.features.shape[1], maps.features.shape[2]
+            coarse = features.shape[1], features.shape[2]
             x, y = (xy / STRIDE).unbind(1)
             # _BORDER_PX keeps keypoints inside the descriptor map
-            read = read_bilinear(pixel_table(maps.features), y, x, coarse)
+            read = read_bilinear(pixel_table(features), y, x, coarse)
             descriptors = functional.normalize(read, dim=1)
-        xy_px = in_image_px(xy.cpu().numpy(), maps.scores.shape, full_size)
+        xy_px = in_image_px(xy.cpu().numpy(), score_map.shape, full_size)
         values = scores.cpu().numpy()
         return np.column_stack([xy_px, values]), values, descriptors
 
@@ -134,14 +135,6 @@ def _scales(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     return levels
 
 
-@dataclass(frozen=True, eq=False)
-class AslFeatMaps:
-    """Non-negative scores float32 (H, W) and unnormalised descriptors (128, h, w) of an image."""
-
-    scores: torch.Tensor
-    features: torch.Tensor
-
-
 class AslFeatNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -154,11 +147,16 @@ class AslFeatNet(nn.Module):
         self.conv6_0 = _Conv(128, 128)
         self.conv6_1 = _Conv(128, 128)
         self.conv6 = _Conv(128, 128, normalised=False)
-        self.deform_param = nn.ModuleDict({name: _Deformation(128) for name in _DEFORMABLE})
-        self.tower = nn.ModuleDict({name: _Scale() for name in _SCORED})
+        self.deform_param = nn.ModuleDict({name: _deformation(128) for name in _DEFORMABLE})
+        self.tower = nn.ModuleDict({name: nn.Module() for name in _SCORED})
+        for part in self.tower.values():
+            part.register_buffer("instance_max", torch.ones(()))
 
-    def forward(self, images: torch.Tensor) -> list[AslFeatMaps]:
-        """Compute the maps of gray images (B, 1, H, W) in [0, 255], both sides at least 11 px."""
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the maps of gray images (B, 1, H, W) in [0, 255], both sides at least 11 px.
+
+        Return non-negative scores float32 (B, H, W) and unnormalised descriptors (B, 128, h, w).
+        """
         height, width = images.shape[2:]
         normalised = []
         for image in torch.split(images, 1):
@@ -176,12 +174,12 @@ class AslFeatNet(nn.Module):
         x = self.conv5.normalised(x)
         for name in _DEFORMABLE:
             x = self._deformable(name, x)
-        scores = scores + self._scores("conv6", x, (height, width))
-        return [AslFeatMaps(*maps) for maps in zip(scores, x, strict=True)]
+        return scores + self._scores("conv6", x, (height, width)), x
 
     def _deformable(self, name: str, x: torch.Tensor) -> torch.Tensor:
         conv: _Conv = getattr(self, name)
-        offset, amplitude = self.deform_param[name](x)
+        sampling = self.deform_param[name]
+        offset, amplitude = sampling["offset"](x), torch.sigmoid(sampling["amplitude"](x))
         if conv.bn is None:
             return deform_conv2d(x, offset, conv.weight, None, amplitude)
         weight, bias = conv.bn.folded_into(conv.weight)
@@ -237,20 +235,9 @@ class _Conv(nn.Module):
         return conv_same(x, *self.bn.folded_into(self.weight), self.stride).relu_()
 
 
-class _Deformation(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.offset = nn.Conv2d(channels, 18, 3, padding=1)
-        self.amplitude = nn.Conv2d(channels, 9, 3, padding=1)
-
-    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.offset(x), torch.sigmoid(self.amplitude(x))
-
-
-class _Scale(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("instance_max", torch.ones(()))
+def _deformation(channels: int) -> nn.ModuleDict:
+    sizes = {"offset": 18, "amplitude": 9}
+    return nn.ModuleDict({k: nn.Conv2d(channels, n, 3, padding=1) for k, n in sizes.items()})
 
 
 def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -89,9 +88,8 @@ class R2D2(LocalNetwork[R2D2Options]):
                 max_size=options.max_size,
             )
             for level in levels:
-                maps = network(in_fast_layout(level))
+                outputs = network(in_fast_layout(level))
                 scale = np.float32(_PATCH_PX * max(images[0].shape[:2]) / max(level.shape[-2:]))
-                outputs = maps.features, maps.reliability[:, 0], maps.repeatability[:, 0]
                 for of_image, features, reliability, repeatability in zip(
                     levels_of, *outputs, strict=True
                 ):
@@ -110,14 +108,6 @@ class R2D2(LocalNetwork[R2D2Options]):
             self._best_of_levels(levels, mask)
             for levels, mask in zip(levels_of, masks, strict=True)
         ]
-
-
-class R2D2Maps(NamedTuple):
-    """Maps of images, each (B, C, H, W)."""
-
-    features: torch.Tensor  # C = 128, one descriptor per pixel, not normalised
-    reliability: torch.Tensor  # C = 1, in [0, 1]: expected matching success of the descriptor
-    repeatability: torch.Tensor  # C = 1, in [0, 1]: expected repeatability of a local maximum
 
 
 class R2D2Network(nn.Module):
@@ -142,14 +132,18 @@ class R2D2Network(nn.Module):
         self.clf = nn.Conv2d(DESCRIPTOR_SIZE, 2, 1)
         self.sal = nn.Conv2d(DESCRIPTOR_SIZE, 1, 1)
 
-    def forward(self, images: torch.Tensor) -> R2D2Maps:
-        """Compute the maps of RGB images, float (B, 3, H, W) in [0, 1]."""
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Compute the maps of RGB images, float (B, 3, H, W) in [0, 1].
+
+        Return unnormalised descriptors (B, 128, H, W) and two maps (B, H, W) in [0, 1]:
+        reliability, the expected matching success of the descriptor, and repeatability of a local
+        maximum.
+        """
         features = self.ops(imagenet_normalised(images))
         squared = features**2
-        positive = functional.softplus(self.sal(squared).float())
-        return R2D2Maps(
-            features, self.clf(squared).float().softmax(dim=1)[:, 1:], positive / (1 + positive)
-        )
+        reliability = self.clf(squared).float().softmax(dim=1)[:, 1]
+        positive = functional.softplus(self.sal(squared).float())[:, 0]
+        return features, reliability, positive / (1 + positive)
 
 
 def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:

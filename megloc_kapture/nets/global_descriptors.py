@@ -155,15 +155,6 @@ def _length(tensors: Mapping[str, torch.Tensor], key: str, default: int) -> int:
     return tensors[key].shape[0] if key in tensors and tensors[key].ndim else default
 
 
-class GeneralizedMean(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.p = nn.Parameter(torch.full((1,), 3.0))
-
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
-        return generalized_mean(features, self.p)
-
-
 class ApGemNet(ResNet):
     """AP-GeM's network from image to unit-norm vector.
 
@@ -183,7 +174,7 @@ class ApGemNet(ResNet):
         normalised_features: bool = False,
     ) -> None:
         super().__init__(depth)
-        self.adpool = GeneralizedMean()
+        self.adpool = nn.ParameterDict({"p": torch.full((1,), 3.0)})
         self.fc = nn.Linear(DESCRIPTOR_SIZE, DESCRIPTOR_SIZE)
         self.normalised_features = normalised_features
         for name, values in (("mean", mean), ("deviation", deviation)):
@@ -193,7 +184,7 @@ class ApGemNet(ResNet):
         """Return unit-norm vectors float32 (B, 2048) of RGB images (B, 3, H, W) in [0, 1]."""
         features = self((image - self.mean) / self.deviation)[-1]
         with torch.autocast(image.device.type, enabled=False):
-            pooled = self.adpool(features)
+            pooled = generalized_mean(features, self.adpool["p"])
             if self.normalised_features:
                 pooled = functional.normalize(pooled)
             return functional.normalize(self.fc(pooled))

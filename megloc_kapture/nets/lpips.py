@@ -15,17 +15,15 @@ from megloc_kapture.nets.trunks import Vgg16Features
 Trunk = Literal["alex", "vgg", "squeeze"]
 
 
-class AlexNetFeatures(nn.Sequential):
-    """AlexNet (Krizhevsky, arXiv 1404.5997) up to layer 11 of torchvision's ``features``."""
-
-    def __init__(self) -> None:
-        layers = [
-            *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
-            *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
-        ]
-        for channels, out in ((192, 384), (384, 256), (256, 256)):
-            layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
-        super().__init__(*layers)
+def alexnet_features() -> nn.Sequential:
+    """Build AlexNet (Krizhevsky, arXiv 1404.5997) up to layer 11 of torchvision's ``features``."""
+    layers = [
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+    ]
+    for channels, out in ((192, 384), (384, 256), (256, 256)):
+        layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
+    return nn.Sequential(*layers)
 
 
 class Fire(nn.Module):
@@ -42,15 +40,13 @@ class Fire(nn.Module):
         return F.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
 
 
-class SqueezeNetFeatures(nn.Sequential):
-    """SqueezeNet 1.1 (Iandola et al., arXiv 1602.07360) up to layer 12 of ``features``."""
-
-    def __init__(self) -> None:
-        first = nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()
-        pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
-        middle = Fire(64, 16, 64), Fire(128, 16, 64), pool, Fire(128, 32, 128), Fire(256, 32, 128)
-        last = Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)
-        super().__init__(*first, pool, *middle, pool, *last)
+def squeezenet_features() -> nn.Sequential:
+    """Build SqueezeNet 1.1 (Iandola et al., arXiv 1602.07360) up to layer 12 of ``features``."""
+    first = nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()
+    pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
+    middle = Fire(64, 16, 64), Fire(128, 16, 64), pool, Fire(128, 32, 128), Fire(256, 32, 128)
+    last = Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)
+    return nn.Sequential(*first, pool, *middle, pool, *last)
 
 
 # compared layers and their channels
@@ -60,24 +56,14 @@ _TAPS: dict[Trunk, tuple[tuple[int, int], ...]] = {
     "squeeze": ((1, 64), (4, 128), (7, 256), (9, 384), (10, 384), (11, 512), (12, 512)),
 }
 _TRUNKS: dict[Trunk, Callable[[], nn.Sequential]] = {
-    "alex": AlexNetFeatures,
+    "alex": alexnet_features,
     "vgg": lambda: Vgg16Features(last=29),
-    "squeeze": SqueezeNetFeatures,
+    "squeeze": squeezenet_features,
 }
 # input normalisation of the published module, for RGB in [-1, 1]
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _MIN_LENGTH = 1e-10
 SMALLEST_PX = 64  # smallest side that leaves enough cells after AlexNet's pooling
-
-
-class _Head(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        # in the published heads, layer 0 is a dropout
-        self.model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.model(x)
 
 
 class Lpips(nn.Module):
@@ -92,7 +78,9 @@ class Lpips(nn.Module):
         self.taps = tuple(number for number, _ in _TAPS[trunk])
         self.features = _TRUNKS[trunk]()
         for number, (_, channels) in enumerate(_TAPS[trunk]):
-            self.add_module(f"lin{number}", _Head(channels))
+            # in the published heads, layer 0 is a dropout
+            head = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
+            self.add_module(f"lin{number}", nn.ModuleDict({"model": head}))
 
     def forward(self, a: torch.Tensor, b: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
         """Return the distances (B,) of image pairs; NaN for pairs without valid pixels.
@@ -122,7 +110,7 @@ class Lpips(nn.Module):
         """Return distances (B,) between results of :meth:`described` with the same valid pixels."""
         total = torch.zeros(len(valid), dtype=valid.dtype, device=valid.device)
         for layer, (a, b) in enumerate(zip(first, second, strict=True)):
-            different = self.get_submodule(f"lin{layer}")((a - b) ** 2)
+            different = self.get_submodule(f"lin{layer}.model")((a - b) ** 2)
             weight = F.interpolate(valid, size=different.shape[-2:], mode="area")
             total = total + (different * weight).sum(dim=(1, 2, 3)) / weight.sum(dim=(1, 2, 3))
         return total

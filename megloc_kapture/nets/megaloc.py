@@ -191,34 +191,25 @@ class DinoV2(nn.Module):
         return torch.cat([learnt[:, :1], maps.flatten(2).mT], dim=1)
 
 
-class LayerScale(nn.Module):
-    """A learnt factor per channel (Touvron et al., ICCV 2021)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.gamma = nn.Parameter(torch.ones(channels))
-
-    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        return tokens * self.gamma
-
-
 class Block(nn.Module):
+    """Transformer block with a learnt factor per channel (Touvron et al., ICCV 2021)."""
+
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(channels, eps=_EPSILON)
         self.attn = Attention(channels, heads)
-        self.ls1 = LayerScale(channels)
+        self.ls1 = nn.ParameterDict({"gamma": torch.ones(channels)})
         self.norm2 = nn.LayerNorm(channels, eps=_EPSILON)
         fc1, fc2 = (
             nn.Linear(channels, _MLP_RATIO * channels),
             nn.Linear(_MLP_RATIO * channels, channels),
         )
         self.mlp = nn.Sequential(OrderedDict(fc1=fc1, activation=nn.GELU(), fc2=fc2))
-        self.ls2 = LayerScale(channels)
+        self.ls2 = nn.ParameterDict({"gamma": torch.ones(channels)})
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
-        return tokens + self.ls2(self.mlp(self.norm2(tokens)))
+        tokens = tokens + self.ls1["gamma"] * self.attn(self.norm1(tokens))
+        return tokens + self.ls2["gamma"] * self.mlp(self.norm2(tokens))
 
 
 class Attention(nn.Module):

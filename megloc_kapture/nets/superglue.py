@@ -49,8 +49,9 @@ class SuperGlueNet(nn.Module):
         super().__init__()
         self.descriptor_size = encoder_sizes[-1]
         self.bin_score = nn.Parameter(torch.tensor(1.0))
-        self.kenc = _KeypointEncoder(encoder_sizes)
-        self.gnn = _GraphNetwork(self.descriptor_size, num_layers)
+        self.kenc = nn.ModuleDict({"encoder": _perceptron([3, *encoder_sizes])})
+        layers = [_Layer(self.descriptor_size) for _ in range(num_layers)]
+        self.gnn = nn.ModuleDict({"layers": nn.ModuleList(layers)})
         self.final_proj = _Pointwise(self.descriptor_size, self.descriptor_size)
 
     def forward(
@@ -67,8 +68,9 @@ class SuperGlueNet(nn.Module):
         with torch.autocast(device, enabled=False):
             scores = torch.cat([image.scores for image in images])
             located = torch.column_stack([torch.cat([image.xy for image in images]), scores])
-            tokens = torch.cat([image.descriptors for image in images]) + self.kenc.encoder(located)
-        for number, layer in enumerate(self.gnn.layers, start=1):
+            encoded = self.kenc["encoder"](located)
+            tokens = torch.cat([image.descriptors for image in images]) + encoded
+        for number, layer in enumerate(self.gnn["layers"], start=1):
             tokens = tokens + layer(tokens, lengths, cross=number % 2 == 0)
         with torch.autocast(device, enabled=False):
             sides = torch.split(self.final_proj(tokens), lengths)
@@ -92,12 +94,6 @@ def _perceptron(sizes: Sequence[int]) -> nn.Sequential:
     for size_in, size_out in pairwise(sizes):
         layers += [_Pointwise(size_in, size_out), nn.BatchNorm1d(size_out), nn.ReLU()]
     return nn.Sequential(*layers[:-2])
-
-
-class _KeypointEncoder(nn.Module):
-    def __init__(self, sizes: Sequence[int]) -> None:
-        super().__init__()
-        self.encoder = _perceptron([3, *sizes])
 
 
 class _Attention(nn.Module):
@@ -141,24 +137,19 @@ class _Layer(nn.Module):
         return self.mlp(torch.cat([tokens, message], dim=1))
 
 
-class _GraphNetwork(nn.Module):
-    def __init__(self, size: int, num_layers: int) -> None:
-        super().__init__()
-        self.layers = nn.ModuleList([_Layer(size) for _ in range(num_layers)])
-
-
 def superglue(tensors: Mapping[str, torch.Tensor], where: str) -> SuperGlueNet:
-    encoder = _numbered(tensors, r"kenc\.encoder\.(\d+)\.weight", dimensions=3)
-    layers = _numbered(tensors, r"gnn\.layers\.(\d+)\.attn\.merge\.weight", dimensions=3)
+    encoder = _numbered(tensors, r"kenc\.encoder\.(\d+)\.weight")
+    layers = _numbered(tensors, r"gnn\.layers\.(\d+)\.attn\.merge\.weight")
     net = SuperGlueNet(encoder, len(layers)) if encoder and layers else SuperGlueNet()
     return load_strictly(net, tensors, where)
 
 
-def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: int) -> list[int]:
+def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str) -> list[int]:
+    """Return the output sizes of the convolutions that match a pattern, by their numbers."""
     sizes = {}
     for key, value in tensors.items():
         matched = re.fullmatch(pattern, key)
-        if matched and value.ndim == dimensions:
+        if matched and value.ndim == 3:
             sizes[int(matched[1])] = value.shape[0]
     return [sizes[number] for number in sorted(sizes)]
 

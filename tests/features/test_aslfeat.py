@@ -14,7 +14,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features import aslfeat
 from megloc_kapture.features.aslfeat import (
     AslFeat,
-    AslFeatMaps,
     AslFeatOptions,
     aslfeat_from,
     on_no_edge,
@@ -51,9 +50,9 @@ def test_keypoints_of_all_scales_have_coordinates_of_the_image(
     monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path
 ) -> None:
     # the score is the brightness, so the spot is detected on every scale
-    def net(gray: torch.Tensor) -> list[AslFeatMaps]:
-        features = torch.ones(128, -(-gray.shape[2] // 4), -(-gray.shape[3] // 4))
-        return [AslFeatMaps(gray[0, 0] / 255, features)]
+    def net(gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        features = torch.ones(1, 128, -(-gray.shape[2] // 4), -(-gray.shape[3] // 4))
+        return gray[:, 0] / 255, features
 
     monkeypatch.setattr(aslfeat.AslFeat, "network", lambda *_: (net, torch.device("cpu")))
     y, x = np.mgrid[:500, :1000] + 0.5
