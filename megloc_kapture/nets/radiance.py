@@ -245,14 +245,14 @@ class NerfW(nn.Module):
     The keys are nerf_pl's: ``nerf_coarse.*``, ``nerf_fine.*``, ``embedding_a.weight`` and
     ``embedding_t.weight``. Only the fine network depends on appearance and has a transient part.
     ``num_images`` and ``num_lights`` are the numbers of rows of the transient and of the appearance
-    embedding, equal by default.
+    embedding.
     """
 
-    def __init__(self, num_images: int, num_lights: int | None = None) -> None:
+    def __init__(self, num_images: int, num_lights: int) -> None:
         super().__init__()
         self.nerf_coarse = NerfMlp()
         self.nerf_fine = NerfMlp(_NERF_APPEARANCE, _NERF_TRANSIENT)
-        self.embedding_a = nn.Embedding(num_lights or num_images, _NERF_APPEARANCE)
+        self.embedding_a = nn.Embedding(num_lights, _NERF_APPEARANCE)
         self.embedding_t = nn.Embedding(num_images, _NERF_TRANSIENT)
 
     @property
@@ -281,30 +281,22 @@ class TriPlane(nn.Module):
     A point's features are products of three planes (K-Planes, Fridovich-Keil et al., CVPR 2023, eq.
     1); small networks turn them into density, colour and a transient part. Most samples lie around
     the known depth or, if it is unknown, around the surface that a first pass finds. Coordinates
-    beyond -1 and 1 are contracted. For ``num_images`` and ``num_lights`` see :class:`NerfW`;
-    ``unconstrained`` models varying light and moving objects.
+    beyond -1 and 1 are contracted. For ``num_images`` and ``num_lights`` see :class:`NerfW`.
     """
 
-    def __init__(
-        self, num_images: int, num_lights: int | None = None, *, unconstrained: bool = True
-    ) -> None:
+    def __init__(self, num_images: int, num_lights: int) -> None:
         super().__init__()
         self.planes = nn.ParameterList(
             nn.Parameter(torch.empty(3, _CHANNELS, size, size).uniform_(0.1, 0.5))
             for size in _RESOLUTIONS
         )
         self.geometry = _mlp(_CHANNELS * len(_RESOLUTIONS), 1 + _GEOMETRY)
-        appearance, transient = (_APPEARANCE, _TRANSIENT) if unconstrained else (0, 0)
-        seen = _GEOMETRY + 3 + 6 * _DIRECTION_FREQUENCIES + appearance
-        self.colour = _mlp(seen, 3)
-        self.appearance: nn.Embedding | None = None
-        self.transient: nn.Embedding | None = None
-        if unconstrained:
-            self.appearance = nn.Embedding(num_lights or num_images, appearance)
-            self.transient = nn.Embedding(num_images, transient)
-            for embedding in (self.appearance, self.transient):
-                nn.init.normal_(embedding.weight, std=0.1)
-            self.moving = _mlp(3 + 6 * _POINT_FREQUENCIES + transient, 5)
+        self.colour = _mlp(_GEOMETRY + 3 + 6 * _DIRECTION_FREQUENCIES + _APPEARANCE, 3)
+        self.appearance = nn.Embedding(num_lights, _APPEARANCE)
+        self.transient = nn.Embedding(num_images, _TRANSIENT)
+        for embedding in (self.appearance, self.transient):
+            nn.init.normal_(embedding.weight, std=0.1)
+        self.moving = _mlp(3 + 6 * _POINT_FREQUENCIES + _TRANSIENT, 5)
 
     def density(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return density (N, S) and features (N, S, 15) at points (N, S, 3)."""
@@ -326,12 +318,10 @@ class TriPlane(nn.Module):
         deltas = spacings(t, rays)
         sigma, features = self.density(points)
         unit = nn.functional.normalize(rays.directions, dim=1)
-        beside = [frequencies(unit, _DIRECTION_FREQUENCIES)]
-        if self.appearance is not None:
-            beside.append(rays.light(self.appearance))
+        beside = [frequencies(unit, _DIRECTION_FREQUENCIES), rays.light(self.appearance)]
         seen = torch.cat([features, _repeated(torch.cat(beside, dim=1), count)], dim=-1)
         rgb = torch.sigmoid(self.colour(seen))
-        if self.transient is None or rays.transient is None:
+        if rays.transient is None:
             return composite(t, deltas, Samples(sigma, rgb))
         entering = frequencies(_contracted(points), _POINT_FREQUENCIES)
         moving = self.moving(torch.cat([entering, _repeated(rays.transient, count)], dim=-1))

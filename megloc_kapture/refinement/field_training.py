@@ -79,12 +79,7 @@ class FieldTrainingOptions(NetworkOptions):
 class FieldTrainer:
     """Trainer of a field on ``views``, of which every ``held_out_every``-th is held out."""
 
-    def __init__(
-        self,
-        views: Sequence[PosedImage],
-        options: FieldTrainingOptions,
-        module: FieldModule | None = None,
-    ) -> None:
+    def __init__(self, views: Sequence[PosedImage], options: FieldTrainingOptions) -> None:
         self.options = options
         every = options.held_out_every
         held_out = list(views[every - 1 :: every]) if every else []
@@ -96,10 +91,9 @@ class FieldTrainer:
         rows = light_rows(images, options.lights)
         self._data = _Pixels(trained, options.max_side_px)
         frame = self._data.frame()
-        if module is None:
-            with torch.random.fork_rng([]):
-                torch.manual_seed(options.seed)
-                module = build_field(options.kind, len(images), max(rows) + 1)
+        with torch.random.fork_rng([]):
+            torch.manual_seed(options.seed)
+            module = build_field(options.kind, len(images), max(rows) + 1)
         module = module.to(pick_device(options.device))
         self._field = NeuralField(module, frame, images, rows)
         self._render = torch.compile(module.render) if options.compiled else module.render
@@ -277,8 +271,8 @@ class _Pixels:
             tensor(directions / frame.scale),
             frame.near,
             frame.far,
-            None if module.appearance is None else module.appearance(field.light_rows[index]),
-            None if module.transient is None else module.transient(index),
+            module.appearance(field.light_rows[index]),
+            module.transient(index),
             None if self._depth is None else tensor(self._depth[rows]),
         )
         return rays, tensor(self._rgb[rows].astype(np.float32) / 255)

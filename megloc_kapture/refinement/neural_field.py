@@ -92,14 +92,12 @@ class NeuralField:
         along = self._tensor(directions / self.frame.scale)
         return Rays(self._tensor(origin).expand_as(along), along, self.frame.near, self.frame.far)
 
-    def appearance_of(self, image: str) -> torch.Tensor | None:
-        """Return the appearance embedding (A,) of a training image; None without embeddings."""
+    def appearance_of(self, image: str) -> torch.Tensor:
+        """Return the appearance embedding (A,) of a training image."""
         if image not in self.images:
             raise DataError(f"the field was not trained on an image {image!r}")
-        embedding = self.module.appearance
-        if embedding is None:
-            return None
-        return embedding.weight[self.light_rows[self.images.index(image)]].detach()
+        row = self.light_rows[self.images.index(image)]
+        return self.module.appearance.weight[row].detach()
 
     @torch.no_grad()
     def render(
@@ -132,20 +130,15 @@ class NeuralField:
         }
         return replace(parts[0], coarse_rgb=None, **joined)
 
-    def fit_appearance(
-        self, rays: Rays, rgb: torch.Tensor, *, seed: int = 0
-    ) -> torch.Tensor | None:
-        """Fit an appearance embedding (A,) to the rays' colours (N, 3); None without embeddings."""
-        embedding = self.module.appearance
-        if embedding is None:
-            return None
-        generator = torch.Generator().manual_seed(seed)
+    def fit_appearance(self, rays: Rays, rgb: torch.Tensor) -> torch.Tensor:
+        """Fit an appearance embedding (A,) to the rays' colours (N, 3)."""
+        generator = torch.Generator().manual_seed(0)
         drawn = torch.randperm(len(rgb), generator=generator)[:_FIT_OF].to(self.device)
         rays, rgb = select(rays, drawn), rgb[drawn]
         with torch.no_grad():
             seen = self.render_rays(rays)
             rays = replace(rays, depth=torch.where(seen.opacity > 0.5, seen.depth, 0.0))
-        fitted = embedding.weight.detach().mean(0).clone().requires_grad_()
+        fitted = self.module.appearance.weight.detach().mean(0).clone().requires_grad_()
         optimizer = torch.optim.Adam([fitted], lr=_FIT_RATE)
         for _ in range(_FIT_STEPS):
             rows = torch.randint(len(rgb), (min(_FIT_RAYS, len(rgb)),), generator=generator)

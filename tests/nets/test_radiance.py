@@ -94,7 +94,7 @@ def test_encoding_has_the_order_of_the_public_code() -> None:
 
 
 def test_nerfw_has_the_sizes_of_the_public_code() -> None:
-    field = NerfW(7)
+    field = NerfW(7, 7)
     # sums of (inputs + 1) * outputs over the layers of the public code
     sizes = [
         sum(value.numel() for value in net.parameters())
@@ -108,10 +108,9 @@ def test_nerfw_has_the_sizes_of_the_public_code() -> None:
 @pytest.mark.parametrize("kind", [NerfW, TriPlane])
 def test_a_field_renders_rays(kind: type[NerfW] | type[TriPlane]) -> None:
     torch.manual_seed(0)
-    field = kind(3)
+    field = kind(3, 3)
     generator = torch.Generator().manual_seed(0)
     rays = rays_of(4)
-    assert field.appearance is not None and field.transient is not None
     images = torch.arange(4) % 3
     full = replace(rays, appearance=field.appearance(images), transient=field.transient(images))
     seen = field.render(full, generator)
