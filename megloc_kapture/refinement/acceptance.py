@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -110,20 +111,14 @@ def accept_or_keep(
 ) -> PoseRefinement:
     """Return the new pose with its covariance, or the old pose with the reason for keeping it."""
     pose = candidate.alignment.cam_from_world
-    comparison = compare_poses(candidate.problem, start, pose)
     moved_m, turned_deg = movement(start, pose)
     measures = {
-        "cost_before": comparison.before.cost,
-        "cost_after": comparison.after.cost,
-        "significance": comparison.significance,
-        "correlation_before": comparison.before.correlation,
-        "correlation_after": comparison.after.correlation,
+        **compare_poses(candidate.problem, start, pose),
         "overlap_before": overlaps[0],
         "overlap_after": overlaps[1],
         "moved_m": moved_m,
         "turned_deg": turned_deg,
         "moved_px": _moved_px(candidate.problem, start, pose),
-        "points": float(comparison.after.count),
         "references": float(len(np.unique(candidate.problem.chosen.groups))),
     }
     uncertainty = covariance(candidate.free, candidate.alignment)
@@ -133,7 +128,7 @@ def accept_or_keep(
         measures["squared_distance"] = squared_distance(start, pose, uncertainty)
     if options.accept_always:
         return PoseRefinement(pose, "", measures, uncertainty)
-    reason = _too_far(moved_m, turned_deg, options) or _no_better(comparison, overlaps, options)
+    reason = _too_far(moved_m, turned_deg, options) or _no_better(measures, options)
     if reason:
         return PoseRefinement(start, reason, measures)
     if uncertainty is None:
@@ -174,15 +169,14 @@ def _too_far(moved_m: float, turned_deg: float, options: RenderingOptions) -> st
     return ""
 
 
-def _no_better(
-    comparison: Comparison, overlaps: tuple[float, float], options: RenderingOptions
-) -> str:
-    after, significance = comparison.after, comparison.significance
-    if after.count < MIN_POINTS:
-        return f"only {after.count} points are seen from both poses"
-    if after.correlation < options.min_correlation:
+def _no_better(measures: Mapping[str, float], options: RenderingOptions) -> str:
+    correlation_after, significance = measures["correlation_after"], measures["significance"]
+    overlap, overlap_after = measures["overlap_before"], measures["overlap_after"]
+    if measures["points"] < MIN_POINTS:
+        return f"only {measures['points']:.0f} points are seen from both poses"
+    if correlation_after < options.min_correlation:
         return (
-            f"the correlation of references and query is {after.correlation:.2f}, "
+            f"the correlation of references and query is {correlation_after:.2f}, "
             f"less than {options.min_correlation:g}"
         )
     if significance < options.min_significance:
@@ -190,55 +184,49 @@ def _no_better(
             f"the cost decreases by {significance:.1f} standard errors, "
             f"less than {options.min_significance:g}"
         )
-    if overlaps[1] < (1.0 - options.max_overlap_loss) * overlaps[0]:
-        return f"the overlap falls from {overlaps[0]:.0%} to {overlaps[1]:.0%}"
+    if overlap_after < (1.0 - options.max_overlap_loss) * overlap:
+        return f"the overlap falls from {overlap:.0%} to {overlap_after:.0%}"
     return ""
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    cost: float
-    correlation: float  # of query and reference values, over all points and channels
-    count: int
+def compare_poses(
+    problem: LevelProblem, old: RigidTransform, new: RigidTransform
+) -> dict[str, float]:
+    """Compare two poses over the points that are visible from both.
 
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    before: Fit
-    after: Fit
-    significance: float
-
-
-def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> Comparison:
-    """Compare the costs of two poses over the points that are visible from both."""
+    Return their costs, the significance of the difference, the correlations of query and reference
+    values over all points and channels, and the number of points.
+    """
     aligned = [problem.nuisance_at(pose) for pose in (old, new)]
     rows = [problem.rows(at) for at in aligned]
     hidden = np.isnan(rows[0][:, 0, 0]) | np.isnan(rows[1][:, 0, 0])
     for each in rows:
         each[hidden, :, 0] = np.nan
     deviation = aligned[1].deviation
-    gained = _losses(rows[0][~hidden], deviation) - _losses(rows[1][~hidden], deviation)
-    before, after = (_fit(problem, each, deviation) for each in rows)
+    squared_scale = (LOSS_SCALE * max(deviation, 1e-12)) ** 2
+    gained = _losses(rows[0][~hidden], squared_scale) - _losses(rows[1][~hidden], squared_scale)
     # sum of the cells' gains divided by its standard error, for independent gains with mean 0
     sums = np.bincount(problem.cells(new, ~hidden), gained)
     error = float(np.sqrt(np.square(sums).sum()))
-    return Comparison(before, after, float(sums.sum()) / error if error > 0 else 0.0)
+    costs = [problem.system_of(each, squared_scale).mean_cost / squared_scale for each in rows]
+    correlations = [_correlation(each, problem.chosen, problem.num_groups) for each in rows]
+    return {
+        "cost_before": costs[0],
+        "cost_after": costs[1],
+        "significance": float(sums.sum()) / error if error > 0 else 0.0,
+        "correlation_before": correlations[0],
+        "correlation_after": correlations[1],
+        "points": float((~hidden).sum()),
+    }
 
 
-def _losses(rows: Float64, deviation: float) -> Float64:
-    squared = np.square(rows[..., 0]).mean(1) / (LOSS_SCALE * max(deviation, 1e-12)) ** 2
+def _losses(rows: Float64, squared_scale: float) -> Float64:
+    squared = np.square(rows[..., 0]).mean(1) / squared_scale
     return np.asarray(0.5 * squared / (1.0 + squared))
 
 
 def correlation(problem: LevelProblem, at: Alignment) -> float:
     return _correlation(problem.rows(at), problem.chosen, problem.num_groups)
-
-
-def _fit(problem: LevelProblem, rows: Float64, deviation: float) -> Fit:
-    squared_scale = (LOSS_SCALE * max(deviation, 1e-12)) ** 2
-    system = problem.system_of(rows, squared_scale)
-    correlated = _correlation(rows, problem.chosen, problem.num_groups)
-    return Fit(system.mean_cost / squared_scale, correlated, system.count)
 
 
 def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:

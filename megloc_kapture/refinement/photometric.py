@@ -99,8 +99,8 @@ class LevelProblem:
         return self._of(self.chosen.subset(which), self.level)
 
     def thinned(self, most: int) -> LevelProblem:
-        few = len(self.chosen.points) <= most
-        return self if few else self._of(self.chosen.thinned(most), self.level)
+        count = len(self.chosen.points)
+        return self if count <= most else self.subset(np.arange(0, count, -(-count // most)))
 
     def within(self, mask: NDArray[np.bool_]) -> LevelProblem:
         size = self.level.valid.shape[1::-1]

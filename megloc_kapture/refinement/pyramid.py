@@ -31,6 +31,8 @@ _CELLS = 80
 # within a cell, the depth of slanted ground varies by as much
 _HIDES = 0.15
 Float64 = NDArray[np.float64]
+Seen = tuple[NDArray[np.bool_], ...]
+"""Per reference, a mask (N,) of its points that are visible in an image."""
 Appearance = Literal["normalised", "colours"]
 _BLUR_PX = 0.8  # Gaussian sigma on every level; bilinear interpolation needs smooth values
 _WINDOW_PX = 17
@@ -47,13 +49,6 @@ class DepthPoints:
 
     points: Float64
     px: Float64
-
-
-@dataclass(frozen=True, eq=False)
-class Visibility:
-    # per reference, bool (N,): points visible in the image
-    seen: tuple[NDArray[np.bool_], ...]
-    covered: NDArray[np.bool_]  # bool (rows, columns), cells of the image with a point
 
 
 def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
@@ -85,14 +80,15 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
         points, px = points[inside], px[inside]
         # points behind a depth edge may be hidden from the image's camera
         alone = DepthPoints(points, px)
-        seen = visibility([alone], camera, RigidTransform.identity()).seen[0]
+        (seen,), _ = visibility([alone], camera, RigidTransform.identity())
         points, px = points[seen], px[seen]
     return DepthPoints(cam_from_world.inverse().apply(points), px)
 
 
 def visibility(
     references: Sequence[DepthPoints], camera: Camera, cam_from_world: RigidTransform
-) -> Visibility:
+) -> tuple[Seen, NDArray[np.bool_]]:
+    """Return the visible points of each reference, and the cells (rows, columns) with a point."""
     from megloc_kapture.refinement.photometric_kernels import camera_of, splat_depths
 
     sides = np.array([camera.width, camera.height], np.float64)
@@ -108,7 +104,7 @@ def visibility(
         splats.append((cells, depths))
     limit = nearest.ravel() * (1.0 + _HIDES)
     seen = tuple((cells >= 0) & (depths <= limit[cells]) for cells, depths in splats)
-    return Visibility(seen, np.isfinite(nearest))
+    return seen, np.isfinite(nearest)
 
 
 def usable_cells(valid: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -230,10 +226,6 @@ class ChosenPoints:
     points: Float64  # float64 (N, 3), in the world
     values: Float64  # float64 (N, C)
     groups: NDArray[np.int64]  # int64 (N,), reference of each point
-
-    def thinned(self, most: int) -> ChosenPoints:
-        step = max(1, -(-len(self.points) // most))
-        return self.subset(np.arange(0, len(self.points), step))
 
     def subset(self, which: NDArray[Any]) -> ChosenPoints:
         return ChosenPoints(self.points[which], self.values[which], self.groups[which])

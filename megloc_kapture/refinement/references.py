@@ -218,6 +218,7 @@ def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -
 
 def _share_seen(view: PosedImage, surface: DepthPoints, other: PosedImage) -> float:
     points = lifted(other)
-    visible = visibility([surface, points], view.camera, view.cam_from_world).seen[1]
+    (_, visible), _ = visibility([surface, points], view.camera, view.cam_from_world)
     unoccluded = DepthPoints(points.points[visible], points.px[visible])
-    return float(visibility([unoccluded], view.camera, view.cam_from_world).covered.mean())
+    _, covered = visibility([unoccluded], view.camera, view.cam_from_world)
+    return float(covered.mean())

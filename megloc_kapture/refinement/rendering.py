@@ -29,7 +29,7 @@ from megloc_kapture.refinement.photometric import (
     minimise,
     unoccluded_points,
 )
-from megloc_kapture.refinement.pyramid import Visibility, choose_points, usable_cells, visibility
+from megloc_kapture.refinement.pyramid import Seen, choose_points, usable_cells, visibility
 from megloc_kapture.refinement.references import (
     Displacement,
     ReferenceImages,
@@ -122,16 +122,16 @@ class _Refining:
         self.points = [lifted(each) for each in references]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
-        sight, overlap = self._visibility(start)
+        seen, overlap = self._visibility(start)
         if overlap < self.least_overlap:
             return _uncovered(start, overlap)
         coarsest = min([len(self.query_levels), *map(len, self.levels)]) - 1
-        searched = self._decide(start, overlap, self._align_from_search(coarsest, start, sight))
+        searched = self._decide(start, overlap, self._align_from_search(coarsest, start, seen))
         clear = searched.accepted and searched.measures["significance"] >= _CLEAR
         if clear or coarsest == 0:
             return searched
         # the best perturbed pose may lead away from a nearly correct pose
-        direct = self._decide(start, overlap, self._align(0, start, sight))
+        direct = self._decide(start, overlap, self._align(0, start, seen))
         if not searched.accepted:
             return direct if direct.accepted else searched
         return max((direct, searched), key=lambda each: each.measures.get("correlation_after", -1))
@@ -139,38 +139,39 @@ class _Refining:
     def judge(
         self, start: RigidTransform, pose: RigidTransform, judged: NDArray[np.bool_] | None
     ) -> PoseRefinement:
-        sight, overlap = self._visibility(pose)
+        seen, overlap = self._visibility(pose)
         if overlap < self.least_overlap:
             return _uncovered(start, overlap)
-        candidate = self._align(0, pose, sight)
+        candidate = self._align(0, pose, seen)
         if candidate is not None and judged is not None:
             candidate = replace(candidate, problem=candidate.problem.within(judged))
         return self._decide(start, overlap, candidate)
 
-    def _visibility(self, pose: RigidTransform) -> tuple[Visibility, float]:
-        sight = visibility(self.points, self.camera, pose)
-        usable = usable_cells(self.query_levels[0].valid, sight.covered.shape)
-        return sight, float((sight.covered & usable).sum() / max(usable.sum(), 1))
+    def _visibility(self, pose: RigidTransform) -> tuple[Seen, float]:
+        """Return the visible points, and the share of the query that they cover."""
+        seen, covered = visibility(self.points, self.camera, pose)
+        usable = usable_cells(self.query_levels[0].valid, covered.shape)
+        return seen, float((covered & usable).sum() / max(usable.sum(), 1))
 
     def _align_from_search(
-        self, coarsest: int, start: RigidTransform, sight: Visibility
+        self, coarsest: int, start: RigidTransform, seen: Seen
     ) -> Candidate | None:
-        problem = self._problem(coarsest, start, sight)
+        problem = self._problem(coarsest, start, seen)
         if len(problem.chosen.points) < MIN_POINTS:
             return None
         pose = self._best_perturbation(problem, start)
-        candidate = self._align(coarsest, pose, sight)
+        candidate = self._align(coarsest, pose, seen)
         for number in range(coarsest - 1, -1, -1):
             if candidate is None:
                 break
             pose = candidate.alignment.cam_from_world
             if number == coarsest - 1:  # later steps are too small to change visibility
-                sight = visibility(self.points, self.camera, pose)
-            candidate = self._align(number, pose, sight)
+                seen, _ = visibility(self.points, self.camera, pose)
+            candidate = self._align(number, pose, seen)
         return candidate
 
-    def _align(self, number: int, pose: RigidTransform, sight: Visibility) -> Candidate | None:
-        problem = self._problem(number, pose, sight)
+    def _align(self, number: int, pose: RigidTransform, seen: Seen) -> Candidate | None:
+        problem = self._problem(number, pose, seen)
         if len(problem.chosen.points) < MIN_POINTS:
             return None
         alignment = problem.nuisance_at(pose)
@@ -181,11 +182,11 @@ class _Refining:
             alignment = minimise(free, alignment, last_step_px=step_px, rounds=1 if number else 2)
         return Candidate(problem, free, alignment)
 
-    def _problem(self, number: int, pose: RigidTransform, sight: Visibility) -> LevelProblem:
+    def _problem(self, number: int, pose: RigidTransform, seen: Seen) -> LevelProblem:
         level = self.query_levels[number]
         levels = [pyramid[number] for pyramid in self.levels]
         count = max(_COARSE_POINTS, level.valid.size // _PX_PER_POINT)
-        chosen = choose_points(self.points, levels, sight.seen, min(self.options.max_points, count))
+        chosen = choose_points(self.points, levels, seen, min(self.options.max_points, count))
         return LevelProblem(chosen, level, self.camera, pose)
 
     def _best_perturbation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
