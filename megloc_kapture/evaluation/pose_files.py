@@ -17,7 +17,6 @@ import logging
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from itertools import islice
@@ -43,6 +42,8 @@ _log = logging.getLogger(__name__)
 COLUMNS = "name qw qx qy qz tx ty tz"
 
 Poses = Mapping[str, RigidTransform]
+RelativePoses = dict[tuple[int, int], RigidTransform | None]
+"""Timestamps of reference and query -> ``query_from_reference``, None if the row has no pose."""
 # a rule, or the challenge's list: image -> name in the pose file, in the list's order
 Names = PoseFileNames | Mapping[str, str]
 
@@ -247,15 +248,6 @@ MLAD_COLUMNS = "src_ts tgt_ts tx ty tz qx qy qz qw"
 _TIMESTAMP = re.compile("0|[1-9][0-9]{0,29}")
 
 
-@dataclass(frozen=True, slots=True)
-class RelativePose:
-    """One row: the timestamps of two keyframes, and their relative pose if the row has one."""
-
-    reference: int
-    query: int
-    query_from_reference: RigidTransform | None = None
-
-
 def timestamp_of(image: str) -> int:
     """Return the timestamp in an image name of 4Seasons (``.../1600000000000000000.png``)."""
     stem = PurePosixPath(image).stem
@@ -276,24 +268,23 @@ def scaled_pose(pose: RigidTransform, scale: float) -> RigidTransform:
     return RigidTransform(pose.quat_wxyz, (x, y, z))
 
 
-def format_mlad_file(rows: Iterable[RelativePose]) -> str:
-    """Return the text of a pose file; reading it gives exactly the same float64 numbers."""
+def format_mlad_file(poses: Mapping[tuple[int, int], RigidTransform]) -> str:
+    """Return the text of a pose file from ``query_from_reference`` by timestamps.
+
+    Reading it gives exactly the same float64 numbers.
+    """
     lines = []
-    for row in rows:
-        pair = f"{row.reference} {row.query}"
-        if row.query_from_reference is None:
-            raise DataError(f"pair {pair} has no pose; MLAD requires every row")
-        given = row.query_from_reference
+    for (reference, query), given in poses.items():
+        pair = f"{reference} {query}"
         pose = checked_pose(given.quat_wxyz, given.translation, f"pair {pair}")
         qw, *vector = pose.quat_wxyz
         lines.append(" ".join([pair, *(repr(float(v)) for v in (*pose.translation, *vector, qw))]))
     return "".join(f"{line}\n" for line in lines)
 
 
-def read_mlad_file(path: Path | str) -> list[RelativePose]:
+def read_mlad_file(path: Path | str) -> RelativePoses:
     """Read a pose file or a relocalization file, in file order."""
-    rows: list[RelativePose] = []
-    pairs: set[tuple[int, int]] = set()
+    poses: RelativePoses = {}
     columns = 0
     for number, line in enumerate(read_text(path).split("\n"), start=1):
         fields = line.split()
@@ -306,12 +297,11 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
                 raise DataError(f"{len(fields)} columns instead of {wanted}")
             reference, query = (parse_timestamp(field) for field in fields[:2])
             whose, pose = f"pair {reference} {query}", None
-            require((reference, query) not in pairs, f"{whose} is given twice")
+            require((reference, query) not in poses, f"{whose} is given twice")
             if columns == 9:
                 pose = parse_pose(fields[2:], "mlad", whose)
-        pairs.add((reference, query))
-        rows.append(RelativePose(reference, query, pose))
-    return rows
+        poses[reference, query] = pose
+    return poses
 
 
 def parse_timestamp(text: str) -> int:

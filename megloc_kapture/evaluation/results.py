@@ -303,10 +303,10 @@ def _read_mlad(
         )
     poses: dict[RelocalizationPair, RigidTransform] = {}
     for file, pose_file in paths.items():
-        for row in pose_files.read_mlad_file(pose_file):
-            asked_pair, pose = asked[file].get((row.reference, row.query)), row.query_from_reference
+        for stamps, pose in pose_files.read_mlad_file(pose_file).items():
+            asked_pair = asked[file].get(stamps)
             if asked_pair is None:
-                problem = f"pair {row.reference} {row.query} is not in the relocalization file"
+                problem = f"pair {stamps[0]} {stamps[1]} is not in the relocalization file"
                 raise DataError(problem, path=pose_file)
             if pose is None:
                 raise DataError(

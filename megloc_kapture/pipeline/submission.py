@@ -15,7 +15,6 @@ from typing import Any
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
 from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.evaluation.pose_files import (
-    RelativePose,
     format_mlad_file,
     format_pose_file,
     is_name,
@@ -228,7 +227,7 @@ def _mlad(results: _Results, tables: Path) -> _Content:
     poses = _posed(results)
     scale = read_world(tables).official_from_local.scale
     references = KaptureFolder(tables.parent / MAPPING).read().poses()
-    rows: dict[str, list[RelativePose]] = {}
+    rows: dict[str, dict[tuple[int, int], RigidTransform]] = {}
     posed, missing = [], []
     for pair in pairs:
         query, reference = poses.get(pair.query), references.get(pair.reference)
@@ -238,8 +237,8 @@ def _mlad(results: _Results, tables: Path) -> _Content:
         else:
             posed.append(pair.query)
             pose = relative_pose(query, reference, scale=scale)
-        row = RelativePose(timestamp_of(pair.reference), timestamp_of(pair.query), pose)
-        rows.setdefault(pair.file, []).append(row)
+        stamps = timestamp_of(pair.reference), timestamp_of(pair.query)
+        rows.setdefault(pair.file, {})[stamps] = pose
     return {name: format_mlad_file(image_rows) for name, image_rows in rows.items()}, posed, missing
 
 

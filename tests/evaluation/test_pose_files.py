@@ -15,7 +15,6 @@ from poses import random_pose
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import (
-    RelativePose,
     format_mlad_file,
     format_pose_file,
     package_versions,
@@ -42,13 +41,13 @@ def test_pose_files_have_the_servers_format(tmp_path: Path) -> None:
         "b.jpg 0.5 0.5 -0.5 0.5 0.3333333333333333 -2e-17 1000000.0\n"
     )
     assert read_pose_file(path) == {"a.jpg": pose, "b.jpg": third}
-    row = RelativePose(1602074877390449152, 5, RigidTransform((0.6, 0.8, 0.0, 0.0), (1 / 3, -1, 3)))
-    path.write_text(format_mlad_file([row]))
+    rows = {(1602074877390449152, 5): RigidTransform((0.6, 0.8, 0.0, 0.0), (1 / 3, -1, 3))}
+    path.write_text(format_mlad_file(rows))
     assert path.read_text() == "1602074877390449152 5 0.3333333333333333 -1.0 3.0 0.8 0.0 0.0 0.6\n"
-    assert read_mlad_file(path) == [row]
-    assert format_pose_file({}) == format_mlad_file([]) == ""
+    assert read_mlad_file(path) == rows
+    assert format_pose_file({}) == format_mlad_file({}) == ""
     path.write_text("")
-    assert read_pose_file(path) == {} and read_mlad_file(path) == []
+    assert read_pose_file(path) == {} and read_mlad_file(path) == {}
 
 
 def test_the_challenge_s_list_gives_names_and_order() -> None:
@@ -63,15 +62,13 @@ def test_the_challenge_s_list_gives_names_and_order() -> None:
     [
         (RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, math.inf, 0.0)), "not finite"),
         (RigidTransform((0.9, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "length 0.9"),
-        (None, "pair 1 2 has no pose; MLAD requires every row"),
     ],
 )
-def test_invalid_poses_are_not_written(pose: RigidTransform | None, words: str) -> None:
+def test_invalid_poses_are_not_written(pose: RigidTransform, words: str) -> None:
     with pytest.raises(DataError, match=words):
-        format_mlad_file([RelativePose(1, 1, HERE), RelativePose(1, 2, pose)])
-    if pose is not None:
-        with pytest.raises(DataError, match=words):
-            format_pose_file({"good.jpg": HERE, "bad.jpg": pose})
+        format_mlad_file({(1, 1): HERE, (1, 2): pose})
+    with pytest.raises(DataError, match=words):
+        format_pose_file({"good.jpg": HERE, "bad.jpg": pose})
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from scored import evaluate_poses, pose_at, write_kapture
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate_results
 from megloc_kapture.evaluation.metrics import thresholds_from_pairs
-from megloc_kapture.evaluation.pose_files import RelativePose, format_mlad_file, relative_pose
+from megloc_kapture.evaluation.pose_files import format_mlad_file, relative_pose
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import plain, report_data, report_text
 from megloc_kapture.evaluation.results import Result
@@ -203,10 +203,9 @@ def test_pose_files_and_folders_have_equal_figures(tmp_path: Path) -> None:
     files.mkdir()
     for file in ("reloc_b.txt", "reloc_c.txt"):
         asked = [(p.reference, p.query) for p in pairs if p.file == file and p.query in estimated]
-        rows = [
-            RelativePose(int(r[2:5]), int(q[2:5]), relative_pose(estimated[q], references[r]))
-            for r, q in asked
-        ]
+        rows = {
+            (int(r[2:5]), int(q[2:5])): relative_pose(estimated[q], references[r]) for r, q in asked
+        }
         (files / file).write_text(format_mlad_file(rows))
     rules = benchmark_of(workspace / "megloc")
     results = [workspace / "localized", files]

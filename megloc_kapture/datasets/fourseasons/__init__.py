@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from megloc_kapture.datasets.official import Count, Missing
 from megloc_kapture.errors import DataError, OptionError, require
-from megloc_kapture.evaluation.pose_files import RelativePose
+from megloc_kapture.evaluation.pose_files import RelativePoses
 from megloc_kapture.io.files import named
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.io.text_lines import fields_of, numbers_of, read_transform, reading_lines
@@ -141,14 +141,14 @@ def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
     return None
 
 
-def read_relocalization(path: Path) -> list[RelativePose]:
-    rows: dict[tuple[int, int], RelativePose] = {}
+def read_relocalization(path: Path) -> RelativePoses:
+    rows: RelativePoses = {}
     with reading_lines(path, comments=True) as lines:
         for first, second, *fields in map(fields_of, lines):
             reference, query = int(first), int(second)
             pose = _transform(fields) if fields else None
-            rows.setdefault((reference, query), RelativePose(reference, query, pose))
-    return list(rows.values())
+            rows.setdefault((reference, query), pose)
+    return rows
 
 
 CAMERAS = ("cam0", "cam1")
@@ -215,7 +215,7 @@ class RelocalizationFile:
     target: str
 
     @cached_property
-    def rows(self) -> list[RelativePose]:
+    def rows(self) -> RelativePoses:
         return read_relocalization(self.path)
 
     def count(self) -> Count:

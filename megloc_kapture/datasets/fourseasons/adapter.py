@@ -210,7 +210,7 @@ class FourSeasons:
         files: Sequence[RelocalizationFile],
         missing: Missing,
     ) -> list[int]:
-        requested = {row.query for f in files if f.target == recording.name for row in f.rows}
+        requested = {query for f in files if f.target == recording.name for _, query in f.rows}
         times = requested or set(poses)
         if self.options.frames == "all" or not times:
             times = requested | set(recording.times_on_disk(CAMERAS[0]))
@@ -246,9 +246,9 @@ def _image_groups(
         image: ImageGroup(location=image.partition("/")[0]) for image in mapping.image_names()
     }
     requested = {
-        chosen.recordings[file.target].image(row.query, CAMERAS[0])
+        chosen.recordings[file.target].image(query_time, CAMERAS[0])
         for file in chosen.files
-        for row in file.rows
+        for _, query_time in file.rows
     }
     requested_recordings = {file.target for file in chosen.files}
     for (timestamp, _), image in query.records_camera.items():
@@ -371,19 +371,19 @@ def challenge_tables(
         poses = cams_from_local[source.name]
         times = [t for t in sorted(poses) if source.image(t, CAMERAS[0]) in map_images]
         indices = {timestamp: index for index, timestamp in enumerate(times)}
-        for row in file.rows:
-            image = target.image(row.query, CAMERAS[0])
-            if row.reference not in indices or image not in query_images:
+        for (reference_time, query_time), query_from_reference in file.rows.items():
+            image = target.image(query_time, CAMERAS[0])
+            if reference_time not in indices or image not in query_images:
                 continue
-            reference = source.image(row.reference, CAMERAS[0])
+            reference = source.image(reference_time, CAMERAS[0])
             pairs.append(RelocalizationPair(file.path.name, reference, image))
-            index = indices[row.reference]
+            index = indices[reference_time]
             near = times[max(0, index - NEIGHBOURS) : index + NEIGHBOURS + 1]
             names = {source.image(t, camera) for t in near for camera in CAMERAS}
-            around.setdefault((target.name, row.query), set()).update(names & map_images)
-            if row.query_from_reference is not None:
-                pose = row.query_from_reference @ poses[row.reference]
-                truth.setdefault((target.name, row.query), pose)
+            around.setdefault((target.name, query_time), set()).update(names & map_images)
+            if query_from_reference is not None:
+                pose = query_from_reference @ poses[reference_time]
+                truth.setdefault((target.name, query_time), pose)
     priors = {
         image: tuple(sorted(permitted))
         for (name, timestamp), permitted in around.items()
