@@ -73,20 +73,20 @@ def generate(street: Street, folder: Path) -> None:
     write_sensors(folder, KaptureData({"camera": sensor}, {}, poses, records, {}))
     write_points3d(folder, street.xyz)
     keypoints = FeatureConfig(KEYPOINTS_TYPE, np.dtype(np.float32), 2)
-    with FeatureWriter(folder, "keypoints", KEYPOINTS_TYPE, keypoints) as writer:
-        for i, name in enumerate(street.names):
-            writer.write(name, street.keypoints_px(i))
+    writer = FeatureWriter(folder, "keypoints", KEYPOINTS_TYPE, keypoints)
+    for i, name in enumerate(street.names):
+        writer.write(name, street.keypoints_px(i))
     needed = {
         int(i) for x in query_places(street) for i in nearest_images(street, x, NUM_CANDIDATES)
     }
     described = FeatureConfig(
         KEYPOINTS_TYPE, np.dtype(np.float32), DIMENSIONS, KEYPOINTS_TYPE, "L2"
     )
-    with FeatureWriter(folder, "descriptors", KEYPOINTS_TYPE, described) as writer:
-        for i in sorted(needed):
-            vectors = unit(np.random.default_rng([4, i]).normal(size=(NUM_KEYPOINTS, DIMENSIONS)))
-            vectors[street.keypoints_of_seen(i)] = descriptors_of_points(street.seen(i))
-            writer.write(street.names[i], vectors)
+    writer = FeatureWriter(folder, "descriptors", KEYPOINTS_TYPE, described)
+    for i in sorted(needed):
+        vectors = unit(np.random.default_rng([4, i]).normal(size=(NUM_KEYPOINTS, DIMENSIONS)))
+        vectors[street.keypoints_of_seen(i)] = descriptors_of_points(street.seen(i))
+        writer.write(street.names[i], vectors)
     descriptors = folder / "reconstruction" / "descriptors" / KEYPOINTS_TYPE
     for i, name in enumerate(street.names):
         if i not in needed:

@@ -295,15 +295,15 @@ def write_kapture(street: Street, queries: Sequence[Query], folder: Path) -> Non
     write_points3d(folder, street.xyz)
     write_observations(folder, {KEYPOINTS_TYPE: observed})
     config = FeatureConfig(KEYPOINTS_TYPE, np.dtype(np.float32), 2)
-    with FeatureWriter(folder, "keypoints", KEYPOINTS_TYPE, config) as writer:
-        for i, name in enumerate(names):
-            writer.write(name, street.keypoints_px(i))
-        for query in queries:
-            writer.write(query.name, query.keypoints_px)
-    with MatchesWriter(folder, KEYPOINTS_TYPE) as matches:
-        for query in queries:
-            for image, pairs, scores in query.matches:
-                matches.write(query.name, image, pairs, scores)
+    writer = FeatureWriter(folder, "keypoints", KEYPOINTS_TYPE, config)
+    for i, name in enumerate(names):
+        writer.write(name, street.keypoints_px(i))
+    for query in queries:
+        writer.write(query.name, query.keypoints_px)
+    matches = MatchesWriter(folder, KEYPOINTS_TYPE)
+    for query in queries:
+        for image, pairs, scores in query.matches:
+            matches.write(query.name, image, pairs, scores)
     write_pairs(
         folder / "pairs.txt",
         [ImagePair(q.name, image, 1.0) for q in queries for image, _, _ in q.matches],

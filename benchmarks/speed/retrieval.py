@@ -81,10 +81,10 @@ def generate(
         data.trajectories[timestamp, "camera"] = RigidTransform.identity()
     write_sensors(folder, data)
     config = FeatureConfig(TYPE, np.dtype("float32"), dimension, None, "L2")
-    with FeatureWriter(folder, "global_features", TYPE, config) as writer:
-        for name, vector in zip(names, vectors, strict=True):
-            if name not in writer:
-                writer.write(name, vector)
+    writer = FeatureWriter(folder, "global_features", TYPE, config)
+    for name, vector in zip(names, vectors, strict=True):
+        if name not in writer:
+            writer.write(name, vector)
     if tar:
         pack(feature_folder(folder, "global_features", TYPE, orphan=False))
     (folder / "complete").touch()

@@ -272,11 +272,9 @@ def hard_link(source: Path, link: Path) -> None:
 
 @contextlib.contextmanager
 def _new_link(link: Path) -> Iterator[None]:
-    try:
+    with writing(link):
         link.parent.mkdir(parents=True, exist_ok=True)
         yield
-    except OSError as error:
-        raise output_error(link, error) from error
 
 
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:

@@ -218,12 +218,12 @@ class KaptureQueries(Queries):
                 path=self._folder.root,
             )
 
-    def _warn_of_other_size(self, local: _StoredType) -> None:
+    def _warn_of_other_size(self, local: MapKeypoints) -> None:
         """Warn if the keypoints of all images span another size than the images."""
         reach = []
         for name in [name for name in self.names if name in local][:_QUERIES_COMPARED]:
             with suppress(DataError):  # a broken file fails alone, with its query
-                pixels = local.keypoints.read(name)[:, :2]
+                pixels = local.keypoints_px(name)[:, :2]
                 size = np.array(self._sensor(name).params[1:3], np.float64)
                 if len(pixels) >= _MIN_COMPARED and size.all():
                     reach.append(float((pixels / size).max()))
@@ -232,7 +232,7 @@ class KaptureQueries(Queries):
                 "%s: keypoints of type %r reach to %.0f %% of the size of the query images; scale "
                 "them if they were extracted at another image size, or the poses are wrong"
             )
-            _log.warning(message, self._folder.root, local.keypoints.type_name, 100 * max(reach))
+            _log.warning(message, self._folder.root, local.name, 100 * max(reach))
 
     def types_of_all(self) -> list[str]:
         return [

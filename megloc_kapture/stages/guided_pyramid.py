@@ -329,24 +329,24 @@ def pyramid_mapping(
     unions: dict[str, KeypointUnion] = {}
     added: dict[str, list[NDArray[Any]]] = defaultdict(list)  # descriptors
     counts, reasons, hard_pairs = _counts(), Counter[str](), set(hard)
-    with MatchesWriter(output, pyramid_type(local_type), orphan=True) as writer:
-        for pair in named:
-            matches, scores = stored.read(*pair)
-            if pair in hard_pairs and mode != "off":
-                directed = matched_of[pair], matched_of[pair[::-1]]
-                variants = [
-                    (at, variant) for at, (of_pair, _) in enumerate(directed) for variant in of_pair
-                ]
-                for image in set(pair) - unions.keys():
-                    unions[image] = KeypointUnion(keypoints.read(image))
-                both = unions[pair[0]], unions[pair[1]]
-                combined = combine((matches, scores), variants, mode, both)
-                for image, new in zip(pair, combined.added, strict=True):
-                    added[image] += [variants[at][1].descriptors[row] for at, row in new.tolist()]
-                reasons[" | ".join(reason for _, reason in directed if reason)] += 1
-                counts.update(_counts(len(matches), combined))
-                matches, scores = combined.matches, combined.scores
-            writer.write(*pair, matches, scores)
+    writer = MatchesWriter(output, pyramid_type(local_type), orphan=True)
+    for pair in named:
+        matches, scores = stored.read(*pair)
+        if pair in hard_pairs and mode != "off":
+            directed = matched_of[pair], matched_of[pair[::-1]]
+            variants = [
+                (at, variant) for at, (of_pair, _) in enumerate(directed) for variant in of_pair
+            ]
+            for image in set(pair) - unions.keys():
+                unions[image] = KeypointUnion(keypoints.read(image))
+            both = unions[pair[0]], unions[pair[1]]
+            combined = combine((matches, scores), variants, mode, both)
+            for image, new in zip(pair, combined.added, strict=True):
+                added[image] += [variants[at][1].descriptors[row] for at, row in new.tolist()]
+            reasons[" | ".join(reason for _, reason in directed if reason)] += 1
+            counts.update(_counts(len(matches), combined))
+            matches, scores = combined.matches, combined.scores
+        writer.write(*pair, matches, scores)
     extended = sorted(image for image, descriptors in added.items() if descriptors)
     for image in extended:
         features.write(image, unions[image].added(), np.stack(added[image]))
@@ -427,16 +427,16 @@ def pyramid_queries(
     plugins = method.extractor, method.matcher
     counts, skipped = _counts(), Counter[str]()
     retried = extended = 0
-    with MatchesWriter(output, larger, orphan=True) as writer:
-        results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
-        for (image, *_), result in zip(jobs, results, strict=True):
-            for matches in result.matches:
-                writer.write(image, *matches)
-            features.write(image, result.added_px, result.added_descriptors)
-            counts.update(result.counts)
-            skipped[result.skipped] += result.counts["pairs_tried"]
-            retried += result.counts["pairs_tried"] > 0
-            extended += len(result.added_px) > 0
+    writer = MatchesWriter(output, larger, orphan=True)
+    results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
+    for (image, *_), result in zip(jobs, results, strict=True):
+        for matches in result.matches:
+            writer.write(image, *matches)
+        features.write(image, result.added_px, result.added_descriptors)
+        counts.update(result.counts)
+        skipped[result.skipped] += result.counts["pairs_tried"]
+        retried += result.counts["pairs_tried"] > 0
+        extended += len(result.added_px) > 0
     features.write_rest()
     _warn_of_skipped(local_type, skipped)
     return {

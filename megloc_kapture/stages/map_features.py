@@ -54,9 +54,9 @@ def move_points(
     )
     none = np.zeros(0, np.int64)
     for reader in (mapping.keypoints(local_type), mapping.descriptors(local_type)):
-        with FeatureWriter(output, reader.kind, local_type, reader.config) as writer:
-            for image in sorted(mapping.read().poses()):
-                writer.write(image, reader.read(image)[rows_of.get(image, none)])
+        writer = FeatureWriter(output, reader.kind, local_type, reader.config)
+        for image in sorted(mapping.read().poses()):
+            writer.write(image, reader.read(image)[rows_of.get(image, none)])
     xyz_rgb = model.points3d()
     kept = np.bincount(moved.point_ids, minlength=len(xyz_rgb)) > 0
     number = np.cumsum(kept) - 1
@@ -176,13 +176,13 @@ def _copy_type(
 ) -> None:
     copies = output / "reconstruction" / kind / type_name
     reader, reconstruction = source.features(kind, type_name), source.root / "reconstruction"
-    with FeatureWriter(output, kind, type_name, reader.config) as writer:
-        for image in filter(reader.__contains__, source.read().image_names()):
-            file = Path(reader.where(image))
-            if file.is_file() and (link_own or not file.is_relative_to(reconstruction)):
-                hard_link(file, copies / f"{image}{SUFFIX[kind]}")
-            else:  # user data, or a member of a tar
-                writer.write(image, reader.read(image))
+    writer = FeatureWriter(output, kind, type_name, reader.config)
+    for image in filter(reader.__contains__, source.read().image_names()):
+        file = Path(reader.where(image))
+        if file.is_file() and (link_own or not file.is_relative_to(reconstruction)):
+            hard_link(file, copies / f"{image}{SUFFIX[kind]}")
+        else:  # user data, or a member of a tar
+            writer.write(image, reader.read(image))
     if kind == "global_features":
         folders = [
             reconstruction / kind / type_name,

@@ -46,9 +46,9 @@ def _write_features(root: Path, folder: KaptureFolder, kind: str) -> None:
         reader = getattr(folder, kind)("rootsift")
         owner = "r2d2_800" if kind == "descriptors" else None
         name, config = "r2d2_800", replace(reader.config, name="r2d2", keypoints_type=owner)
-    with FeatureWriter(root, kind, name, config) as writer:
-        for image in folder.read().image_names():
-            writer.write(image, reader.read(image))
+    writer = FeatureWriter(root, kind, name, config)
+    for image in folder.read().image_names():
+        writer.write(image, reader.read(image))
 
 
 def rename_type(root: Path) -> None:

@@ -192,9 +192,10 @@ def test_wrong_observations_name_the_file(tmp_path: Path, row: str, message: str
 def test_truncated_arrays_are_named(
     tmp_path: Path, kind: ArrayKind, config: FeatureConfig, size: int, message: str
 ) -> None:
-    with FeatureWriter(tmp_path, kind, "T", config) as writer:
-        writer.put(f"a.jpg{SUFFIX[kind]}", bytes(size))
-    features = FeatureReader(kind, "T", [feature_folder(tmp_path, kind, "T", orphan=False)])
+    FeatureWriter(tmp_path, kind, "T", config)
+    folder = feature_folder(tmp_path, kind, "T", orphan=False)
+    (folder / f"a.jpg{SUFFIX[kind]}").write_bytes(bytes(size))
+    features = FeatureReader(kind, "T", [folder])
     for read in (features.read, features.length):
         with pytest.raises(DataError, match=rf"a\.jpg\.\w+: {size} bytes are not {message}"):
             read("a.jpg")

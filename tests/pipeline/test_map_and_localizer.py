@@ -37,9 +37,9 @@ def shift_keypoints(root: Path, shift_px: float) -> None:
     """Store the keypoints of a map shifted."""
     reader = KaptureFolder(root).keypoints("rootsift")
     arrays = {image: reader.read(image) for image in reader.names}
-    with FeatureWriter(root, "keypoints", "rootsift", reader.config) as writer:
-        for image, array in arrays.items():
-            writer.write(image, array + np.float32(shift_px))
+    writer = FeatureWriter(root, "keypoints", "rootsift", reader.config)
+    for image, array in arrays.items():
+        writer.write(image, array + np.float32(shift_px))
 
 
 def shift_intrinsics(root: Path, shift_px: float) -> None:
@@ -207,11 +207,8 @@ def test_extractors_are_recognised_by_names_of_other_tools(
 ) -> None:
     of_keypoints = FeatureConfig(config, np.dtype(np.float32), 2)
     of_descriptors = FeatureConfig(config, np.dtype(dtype), 128, name, "L2")
-    with (
-        FeatureWriter(tmp_path, "keypoints", name, of_keypoints),
-        FeatureWriter(tmp_path, "descriptors", name, of_descriptors),
-    ):
-        pass
+    FeatureWriter(tmp_path, "keypoints", name, of_keypoints)
+    FeatureWriter(tmp_path, "descriptors", name, of_descriptors)
     unused: Any = None
     keypoints = MapKeypoints(KaptureFolder(tmp_path), name, index=unused, pixel_origin=unused)
     found = keypoints.extractor()

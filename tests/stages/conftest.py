@@ -142,9 +142,9 @@ def write_features() -> Callable[..., None]:
         keypoints_type = name if kind == "descriptors" else None
         metric = None if kind == "keypoints" else "L2"
         config = FeatureConfig(name, like.dtype, like.shape[-1], keypoints_type, metric)
-        with FeatureWriter(root, kind, name, config, orphan=True) as writer:
-            for image, array in arrays.items():
-                writer.write(image, array)
+        writer = FeatureWriter(root, kind, name, config, orphan=True)
+        for image, array in arrays.items():
+            writer.write(image, array)
 
     return write
 

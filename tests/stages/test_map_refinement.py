@@ -284,11 +284,11 @@ def write_wall(root: Path, *, unposed: Sequence[int] = ()) -> KaptureFolder:
                 of_type[other].append((point, 0))
     seen = {}
     for name, rows in of_type.items():
-        with FeatureWriter(
+        writer = FeatureWriter(
             root, "keypoints", name, FeatureConfig(name, np.dtype(np.float32), 2)
-        ) as writer:
-            for image_name, pixels in keypoints.items():
-                writer.write(image_name, pixels)
+        )
+        for image_name, pixels in keypoints.items():
+            writer.write(image_name, pixels)
         points, images = np.array(rows).T
         ids = images.astype(np.int32), points.astype(np.int32)
         seen[name] = Observations(name, NAMES, points, *ids)

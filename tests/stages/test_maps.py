@@ -155,11 +155,11 @@ def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_pat
         half = {image: whole.read(image)[::2] for image in whole.names}
         write_features(features, kind, "half", half)
     reader = world.with_matches("mapping").matches("rootsift")
-    with MatchesWriter(features, "half", orphan=True) as writer:
-        for a, b in reader.pairs:
-            rows, scores = reader.read(a, b)
-            even = (rows % 2 == 0).all(axis=1)
-            writer.write(a, b, rows[even] // 2, scores[even].astype(np.float32))
+    writer = MatchesWriter(features, "half", orphan=True)
+    for a, b in reader.pairs:
+        rows, scores = reader.read(a, b)
+        even = (rows % 2 == 0).all(axis=1)
+        writer.write(a, b, rows[even] // 2, scores[even].astype(np.float32))
     mapping = world.with_matches("mapping")
     mapping = mapping.with_features([*mapping.features_dirs, features])
     both, alone, options = tmp_path / "both", tmp_path / "alone", TriangulationOptions()
@@ -194,13 +194,13 @@ def published(source: KaptureFolder, root: Path) -> KaptureFolder:
     numbers = np.zeros(len(seen), np.int32)
     rng = np.random.default_rng(0)
     config = FeatureConfig("published", np.dtype(np.float32), 2)
-    with FeatureWriter(root, "keypoints", TYPE, config) as writer:
-        for row, image in enumerate(seen.image_names):
-            here = np.flatnonzero(seen.image_ids == row)
-            used = rng.permutation(np.unique(seen.keypoint_ids[here]))
-            for number, keypoint in enumerate(used.tolist()):
-                numbers[here[seen.keypoint_ids[here] == keypoint]] = number
-            writer.write(image, source.keypoints(TYPE).read(image)[used, :2])
+    writer = FeatureWriter(root, "keypoints", TYPE, config)
+    for row, image in enumerate(seen.image_names):
+        here = np.flatnonzero(seen.image_ids == row)
+        used = rng.permutation(np.unique(seen.keypoint_ids[here]))
+        for number, keypoint in enumerate(used.tolist()):
+            numbers[here[seen.keypoint_ids[here] == keypoint]] = number
+        writer.write(image, source.keypoints(TYPE).read(image)[used, :2])
     again = Observations(TYPE, seen.image_names, seen.point_ids, seen.image_ids, numbers)
     write_observations(root, {TYPE: again})
     return KaptureFolder(root)

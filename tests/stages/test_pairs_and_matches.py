@@ -215,11 +215,11 @@ PAIRS = [
 def write_matches(root: Path, counts: dict[tuple[str, str], tuple[int, int]], name: str) -> None:
     """Write matches and the table of their counts (all, verified) by pair."""
     table = []
-    with MatchesWriter(root, name, orphan=True) as writer:
-        for (image, other), (found, verified) in counts.items():
-            rows = np.stack([np.arange(verified)] * 2, axis=1)
-            writer.write(image, other, rows, np.ones(verified))
-            table.append(PairCount(image, other, found, verified))
+    writer = MatchesWriter(root, name, orphan=True)
+    for (image, other), (found, verified) in counts.items():
+        rows = np.stack([np.arange(verified)] * 2, axis=1)
+        writer.write(image, other, rows, np.ones(verified))
+        table.append(PairCount(image, other, found, verified))
     write_match_counts(root, name, table)
 
 
@@ -266,10 +266,10 @@ def test_one_local_type_can_be_chosen_for_reranking(tmp_path: Path) -> None:
 
 def test_coverage_counts_each_keypoint_once(tmp_path: Path) -> None:
     matched = {"z": [0, 1, 2, 3], "y": [0, 1, 2], "x": [5, 6, 5], "w": []}
-    with MatchesWriter(tmp_path, "a", orphan=True) as writer:
-        for image, rows in matched.items():
-            both = np.stack([rows, np.arange(len(rows))], axis=1).astype(np.int64)
-            writer.write("q1", image, both, np.ones(len(rows)))
+    writer = MatchesWriter(tmp_path, "a", orphan=True)
+    for image, rows in matched.items():
+        both = np.stack([rows, np.arange(len(rows))], axis=1).astype(np.int64)
+        writer.write("q1", image, both, np.ones(len(rows)))
     assert run(tmp_path, "a", "coverage", 3)["q1"] == [("z", 4), ("x", 2), ("y", 0)]
     pair = VerifiedMatches(np.array([[3, 0], [5, 1]]), np.ones(2, np.float32), num_found=9)
     assert (counted(pair, "matches"), counted(pair, "verified")) == (9, 2)

@@ -14,7 +14,7 @@ import tarfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -205,27 +205,6 @@ class TarBlobs:
 BlobSource: TypeAlias = FolderBlobs | TarBlobs
 
 
-class BlobWriter:
-    """Writer of feature arrays below a folder, each atomically; a context manager."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def has(self, name: str) -> bool:
-        return safe_join(self._folder, name).is_file()
-
-    def put(self, name: str, content: bytes) -> Path:
-        path = safe_join(self._folder, name)
-        write_bytes(path, content)
-        return path
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 def blob_sources(folder: Path, kind: FeatureKind) -> list[BlobSource]:
     """Return the tar of a type's folder, if any, and its loose files."""
     files = FolderBlobs(folder, SUFFIX[kind])
@@ -344,8 +323,8 @@ class KaptureVectors:
 # --------------------------------------------------------------------------------- writing
 
 
-class FeatureWriter(BlobWriter):
-    """Writer for the features of one kind and type; a context manager.
+class FeatureWriter:
+    """Writer for the features of one kind and type.
 
     Each file is written atomically. A stopped run can resume with the same configuration:
     ``image in writer`` is True if the image's file exists.
@@ -361,19 +340,20 @@ class FeatureWriter(BlobWriter):
         orphan: bool = False,
     ) -> None:
         self.kind, self.type_name, self.config = kind, type_name, config
-        folder = feature_folder(Path(root), kind, type_name, orphan=orphan)
-        self._path = path = folder / f"{kind}.txt"
+        self._folder = feature_folder(Path(root), kind, type_name, orphan=orphan)
+        self._path = path = self._folder / f"{kind}.txt"
         content = format_config(kind, config)
         if not path.exists():
             write_bytes(path, content)
         elif format_config(kind, read_config(path, kind)) != content:
             raise OutputError(f"{path}: has another configuration; remove its folder first")
-        super().__init__(folder)
 
     def __contains__(self, image: str) -> bool:
-        return self.has(image + SUFFIX[self.kind])
+        return safe_join(self._folder, image + SUFFIX[self.kind]).is_file()
 
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write an image's array, (N, dsize) or (dsize,); return the configuration and its file."""
         content = np.ascontiguousarray(array, dtype=self.config.dtype).tobytes()
-        return self._path, self.put(check_field(image) + SUFFIX[self.kind], content)
+        path = safe_join(self._folder, check_field(image) + SUFFIX[self.kind])
+        write_bytes(path, content)
+        return self._path, path

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import check_relative, output_error, write_bytes
+from megloc_kapture.io.files import check_relative, safe_join, write_bytes, writing
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
     BlobSource,
-    BlobWriter,
     blob_sources,
     feature_folder,
 )
@@ -95,21 +94,18 @@ class MatchesReader:
         return None
 
 
-class MatchesWriter(BlobWriter):
-    """Context manager that writes matches of one keypoints type, each file atomically."""
+class MatchesWriter:
+    """Writer for the matches of one keypoints type; each file is written atomically."""
 
     def __init__(self, root: Path, type_name: str, *, orphan: bool = False) -> None:
         self.type_name = type_name
-        folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
-        try:
+        self._folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
+        with writing(self._folder):
             # kapture finds a type by its folder, so it exists even if no pair is written
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise output_error(folder, error) from error
-        super().__init__(folder)
+            self._folder.mkdir(parents=True, exist_ok=True)
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
-        return self.has(_name(min(pair), max(pair)))
+        return safe_join(self._folder, _name(min(pair), max(pair))).is_file()
 
     def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
         """Write indices (M, 2) in the order ``a``, ``b`` and scores (M,); return the file."""
@@ -118,7 +114,9 @@ class MatchesWriter(BlobWriter):
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
         rows[:, 2] = scores
         name = _name(check_field(min(a, b)), check_field(max(a, b)))
-        return self.put(name, rows.tobytes())
+        path = safe_join(self._folder, name)
+        write_bytes(path, rows.tobytes())
+        return path
 
 
 def _name(first: str, second: str) -> str:

@@ -61,14 +61,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     # far from their epipolar lines, which run across the images
     near_px[NUM_RIGHT : NUM_RIGHT + NUM_WRONG, 1] += 60.0
     config = FeatureConfig("x", np.dtype("<f4"), 2)
-    with FeatureWriter(workspace, "keypoints", "x", config, orphan=True) as keypoints:
-        for name, px in ((QUERY, query_px), (NEAR, near_px), (FAR, near_px)):
-            keypoints.write(name, px.astype(np.float32))
+    keypoints = FeatureWriter(workspace, "keypoints", "x", config, orphan=True)
+    for name, px in ((QUERY, query_px), (NEAR, near_px), (FAR, near_px)):
+        keypoints.write(name, px.astype(np.float32))
     matched = np.arange(NUM_RIGHT + NUM_WRONG)
-    with MatchesWriter(workspace / "matches/query", "x", orphan=True) as matches:
-        both = np.stack([matched, matched], axis=1)
-        matches.write(QUERY, NEAR, both, np.ones(len(matched)))
-        matches.write(QUERY, FAR, both[:5], np.ones(5))
+    matches = MatchesWriter(workspace / "matches/query", "x", orphan=True)
+    both = np.stack([matched, matched], axis=1)
+    matches.write(QUERY, NEAR, both, np.ones(len(matched)))
+    matches.write(QUERY, FAR, both[:5], np.ones(5))
     context = context_of(workspace / "localized")
     return Run(workspace, context, query_px[matched], near_px[matched])
 

@@ -216,9 +216,9 @@ def test_points_without_colours_get_image_colours(make_map: Any) -> None:
         "# kapture format: 1.1\n0, x, m/0.jpg, 0\n1, x, m/0.jpg, 1\n2, x, m/1.jpg, 0\n"
     )
     config = FeatureConfig("x", np.dtype("<f4"), 2)
-    with FeatureWriter(root, "keypoints", "x", config) as keypoints:
-        keypoints.write(names[0], np.float32([[100.5, 50.5], [639.9, 479.9]]))
-        keypoints.write(names[1], np.float32([[0.1, 0.1]]))
+    keypoints = FeatureWriter(root, "keypoints", "x", config)
+    keypoints.write(names[0], np.float32([[100.5, 50.5], [639.9, 479.9]]))
+    keypoints.write(names[1], np.float32([[0.1, 0.1]]))
     colors = {"m/0.jpg": (200, 30, 40), "m/1.jpg": (10, 150, 60)}
     for name, color in colors.items():
         pixels = np.full((480, 640, 3), color, np.uint8)

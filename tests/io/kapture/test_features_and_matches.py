@@ -47,10 +47,10 @@ def test_arrays_outside_a_kapture_read_back_from_the_layout_of_kapture_localizat
     """test_interop.py reads the layout inside a kapture with kapture itself."""
     shape = (config.dsize,) if kind == "global_features" else (5, config.dsize)
     array = (np.random.default_rng(0).normal(100, 50, shape)).astype(config.dtype)
-    with FeatureWriter(tmp_path, kind, "T 1", config, orphan=True) as writer:
-        assert "b/x 1.jpg" not in writer
-        writer.write("b/x 1.jpg", array)
-        assert "b/x 1.jpg" in writer
+    writer = FeatureWriter(tmp_path, kind, "T 1", config, orphan=True)
+    assert "b/x 1.jpg" not in writer
+    writer.write("b/x 1.jpg", array)
+    assert "b/x 1.jpg" in writer
     written = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
     assert written == {f"{place}/{kind}.txt", f"{place}/b/x 1.jpg{SUFFIX[kind]}"}
     assert list_types(tmp_path, kind, orphan=True) == ["T 1"]
@@ -69,9 +69,9 @@ def test_the_first_of_several_folders_is_used_and_their_configurations_must_agre
 ) -> None:
     values = {"map": {"a": 1.0, "both": 1.0}, "query": {"b": 2.0, "both": 2.0}}
     for part, images in values.items():
-        with FeatureWriter(tmp_path / part, "keypoints", "T", KEYPOINTS, orphan=True) as writer:
-            for image, value in images.items():
-                writer.write(image, np.full((1, 3), value))
+        writer = FeatureWriter(tmp_path / part, "keypoints", "T", KEYPOINTS, orphan=True)
+        for image, value in images.items():
+            writer.write(image, np.full((1, 3), value))
     folders = [feature_folder(tmp_path / p, "keypoints", "T", orphan=True) for p in values]
     features = FeatureReader("keypoints", "T", folders)
     assert features.names == ["a", "b", "both"]
@@ -82,11 +82,11 @@ def test_the_first_of_several_folders_is_used_and_their_configurations_must_agre
 
 
 def test_a_writer_continues_a_folder_of_the_same_configuration_only(tmp_path: Path) -> None:
-    with FeatureWriter(tmp_path, "keypoints", "T", KEYPOINTS) as writer:
-        writer.write("a", np.zeros((1, 3)))
-    with FeatureWriter(tmp_path, "keypoints", "T", KEYPOINTS) as writer:
-        assert "a" in writer
-        assert "b" not in writer
+    writer = FeatureWriter(tmp_path, "keypoints", "T", KEYPOINTS)
+    writer.write("a", np.zeros((1, 3)))
+    writer = FeatureWriter(tmp_path, "keypoints", "T", KEYPOINTS)
+    assert "a" in writer
+    assert "b" not in writer
     with pytest.raises(OutputError, match="another configuration"):
         FeatureWriter(tmp_path, "keypoints", "T", FeatureConfig("n", np.dtype("float32"), 2))
 
@@ -122,11 +122,11 @@ def matches_reader(root: Path, *, orphan: bool = False) -> MatchesReader:
 def test_matches_read_back_in_either_order(
     tmp_path: Path, pair: tuple[str, str], orphan: bool
 ) -> None:
-    with MatchesWriter(tmp_path, "T", orphan=orphan) as writer:
-        assert pair not in writer
-        writer.write(*pair, INDICES, SCORES)
-        assert pair in writer and pair[::-1] in writer
-        writer.write("c", "b.jpg", [], [])
+    writer = MatchesWriter(tmp_path, "T", orphan=orphan)
+    assert pair not in writer
+    writer.write(*pair, INDICES, SCORES)
+    assert pair in writer and pair[::-1] in writer
+    writer.write("c", "b.jpg", [], [])
     matches = matches_reader(tmp_path, orphan=orphan)
     assert matches.pairs == [("a/x.jpg", "b.jpg"), ("b.jpg", "c")]
     assert pair in matches and pair[::-1] in matches and ("a/x.jpg", "c") not in matches

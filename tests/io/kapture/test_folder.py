@@ -34,17 +34,15 @@ def root(tmp_path: Path) -> Path:
     write_sensors(root, one_camera(IMAGES, RigidTransform.identity()))
     for image in IMAGES:
         write_image(root / "sensors/records_data" / image, np.full((6, 8, 3), 100, np.uint8))
-    with (
-        FeatureWriter(root, "keypoints", "T", FeatureConfig("k", FLOAT, 2)) as keypoints,
-        FeatureWriter(root, "descriptors", "T", FeatureConfig("d", FLOAT, 4, "T")) as descriptors,
-        FeatureWriter(root, "global_features", "G", FeatureConfig("g", FLOAT, 3)) as features,
-        MatchesWriter(root, "T") as matches,
-    ):
-        for image in IMAGES:
-            keypoints.write(image, np.ones((5, 2)))
-            descriptors.write(image, np.ones((5, 4)))
-            features.write(image, np.ones(3))
-        matches.write(*IMAGES, np.array([[0, 4], [3, 1]]), np.ones(2))
+    keypoints = FeatureWriter(root, "keypoints", "T", FeatureConfig("k", FLOAT, 2))
+    descriptors = FeatureWriter(root, "descriptors", "T", FeatureConfig("d", FLOAT, 4, "T"))
+    features = FeatureWriter(root, "global_features", "G", FeatureConfig("g", FLOAT, 3))
+    matches = MatchesWriter(root, "T")
+    for image in IMAGES:
+        keypoints.write(image, np.ones((5, 2)))
+        descriptors.write(image, np.ones((5, 4)))
+        features.write(image, np.ones(3))
+    matches.write(*IMAGES, np.array([[0, 4], [3, 1]]), np.ones(2))
     write_points3d(root, np.ones((3, 3)))
     write_points(root)
     return root
@@ -100,11 +98,11 @@ def test_paths_of_images_and_depth_maps_stay_inside_the_folder(root: Path) -> No
 def test_features_of_additional_folders_are_added(root: Path, tmp_path: Path) -> None:
     additional = tmp_path / "additional"
     config = FeatureConfig("k", FLOAT, 2)
-    with FeatureWriter(additional, "keypoints", "T", config, orphan=True) as writer:
-        writer.write("query.jpg", np.zeros((1, 2)))
-        writer.write("a.jpg", np.zeros((9, 2)))
-    with MatchesWriter(additional, "U", orphan=True) as matches:
-        matches.write("a.jpg", "query.jpg", np.array([[0, 0]]), np.ones(1))
+    writer = FeatureWriter(additional, "keypoints", "T", config, orphan=True)
+    writer.write("query.jpg", np.zeros((1, 2)))
+    writer.write("a.jpg", np.zeros((9, 2)))
+    matches = MatchesWriter(additional, "U", orphan=True)
+    matches.write("a.jpg", "query.jpg", np.array([[0, 0]]), np.ones(1))
     folder = KaptureFolder(root, features_dirs=[additional, tmp_path / "absent"])
     keypoints = folder.keypoints("T")
     assert keypoints.names == ["a.jpg", "b/c.jpg", "query.jpg"]

@@ -114,11 +114,11 @@ OBSERVATIONS = Observations("T", IMAGES, IDS[0].astype(np.int64), *IDS[1:])
 def write_ours(root: Path) -> None:
     write_sensors(root, our_data())
     for kind, by_image in arrays().items():
-        with FeatureWriter(root, kind, "T", CONFIGS[kind]) as writer:  # type: ignore[arg-type]
-            for image, array in by_image.items():
-                writer.write(image, array)
-    with MatchesWriter(root, "T") as matches:
-        matches.write(IMAGES[1], IMAGES[0], INDICES, SCORES)
+        writer = FeatureWriter(root, kind, "T", CONFIGS[kind])  # type: ignore[arg-type]
+        for image, array in by_image.items():
+            writer.write(image, array)
+    matches = MatchesWriter(root, "T")
+    matches.write(IMAGES[1], IMAGES[0], INDICES, SCORES)
     write_points3d(root, POINTS)
     write_observations(root, {"T": OBSERVATIONS})
 

@@ -17,9 +17,9 @@ NAMES = [f"{k % 3}/{k:03d}.jpg" for k in range(40)]
 
 def write(root: Path, rows: NDArray[np.floating]) -> FeatureReader:
     config = FeatureConfig("g", rows.dtype, rows.shape[1], None, "L2")
-    with FeatureWriter(root, "global_features", "G", config) as writer:
-        for name, row in zip(NAMES, rows, strict=False):
-            writer.write(name, row)
+    writer = FeatureWriter(root, "global_features", "G", config)
+    for name, row in zip(NAMES, rows, strict=False):
+        writer.write(name, row)
     return FeatureReader("global_features", "G", [root / FOLDER])
 
 
