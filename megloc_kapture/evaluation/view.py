@@ -10,14 +10,13 @@ import base64
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from pydantic.alias_generators import to_camel
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.evaluation.evaluate import (
@@ -27,6 +26,7 @@ from megloc_kapture.evaluation.evaluate import (
     results_without_truth,
 )
 from megloc_kapture.evaluation.report.queries import (
+    NO_POSE_COLOR,
     StoredInliers,
     frame_of_query,
     legend,
@@ -62,46 +62,6 @@ _OURS, _HEAD_BYTES = b'content="megloc view"', 1000
 _ANY_CAMERA = Camera.pinhole(4, 3, 4)  # for unknown intrinsics
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Content of a view.
-
-    Attributes
-    ----------
-    origin : float64 (3,), subtracted from all coordinates.
-    points, colors : (P, 3), points of the map.
-    camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of the map cameras, estimated poses and
-        true poses: the centre, then rays at depth 1 through the upper left, upper right, lower
-        right and lower left corner of the image; NaN without a pose.
-    queries : worst first.
-    inliers : float32 (K, 3), the drawn inliers of all queries; ``num_inliers`` counts them per
-        query.
-    radius : radius of the visible content around the origin.
-    frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
-        and ``query_frames`` are indices into them.
-    notes : sentences about omissions.
-    """
-
-    title: str
-    origin: NDArray[np.float64]
-    up: NDArray[np.float64]
-    points: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    cameras: tuple[str, ...]
-    camera_frusta: NDArray[np.float32]
-    queries: tuple[QueryResult, ...]
-    frusta: NDArray[np.float32]
-    true_frusta: NDArray[np.float32]
-    inliers: NDArray[np.float32]
-    num_inliers: tuple[int, ...]
-    radius: float
-    frames: tuple[str, ...]
-    point_frames: NDArray[np.uint8]
-    camera_frames: NDArray[np.uint8]
-    query_frames: NDArray[np.uint8]
-    notes: tuple[str, ...]
-
-
 def write_view(
     path: Path | str,
     mapping: KaptureFolder | Path | str,
@@ -130,11 +90,12 @@ def write_view(
         title = evaluation.label or title
     elif truth is not None:
         raise OptionError("true poses need a result to compare with")
-    scene = scene_of(title, StoredInliers(context), queries)
-    if scene is None:
+    view = view_data(StoredInliers(context), queries)
+    if view is None:
         raise DataError("no image has a pose, so there is nothing to show", path=folder.root)
-    write_bytes(path, render_view(scene).encode("utf-8"))
-    return " ".join(scene.notes)
+    data, notes = view
+    write_bytes(path, render_view(title, data, queries, notes).encode("utf-8"))
+    return " ".join(notes)
 
 
 def _evaluate(
@@ -159,10 +120,18 @@ def _check_output(path: Path, *, force: bool) -> None:
         raise OutputError(f"{path}: exists and is not a view; -f overwrites it")
 
 
-def scene_of(
-    title: str, stored: StoredInliers, queries: Sequence[QueryResult] = ()
-) -> Scene | None:
-    """Return the scene of a map and of ranked queries; None if no camera has a pose."""
+def view_data(
+    stored: StoredInliers, queries: Sequence[QueryResult] = ()
+) -> tuple[dict[str, Any], list[str]] | None:
+    """Return the data of the page's script, and sentences about what they omit.
+
+    None if no camera has a pose. ``queries`` are ranked, worst first. Coordinates are float32,
+    relative to ``origin``. A frustum (5, 3) has the camera's centre, then rays at depth 1 through
+    the upper left, upper right, lower right and lower left corner of the image; NaN without a pose.
+    ``inliers`` (K, 3) are those of all queries, one after the other; ``drawn`` counts them per
+    query. Frames of points, cameras and queries are indices into ``frames``, of which one is shown
+    at a time. ``radius`` is that of the content in view at first.
+    """
     context, notes = stored.context, list[str]()
     rng = np.random.default_rng(_SEED)
     mapping = context.mapping
@@ -212,42 +181,14 @@ def scene_of(
         notes.append(f"At most {most} inliers per query are drawn.")
     inliers = [xyz[spread(len(xyz), most)] for xyz in inliers]
     up = np.cross(*page)
-    return Scene(
-        title=title,
-        origin=origin,
-        up=up,
-        points=(points[:, :3] - origin).astype(np.float32),
-        colors=_colors(points, up, mapping, kept),
-        cameras=tuple(names),
-        camera_frusta=_frusta(poses, _rays(mapping, names, {}), origin),
-        queries=tuple(queries),
-        frusta=_frusta([query.cam_from_world for query in queries], rays, origin),
-        true_frusta=_frusta([query.truth for query in queries], rays, origin),
-        inliers=(np.concatenate([np.zeros((0, 3)), *inliers]) - origin).astype(np.float32),
-        num_inliers=tuple(map(len, inliers)),
-        radius=max(float(np.linalg.norm(high - low)) / 2, 1e-3),
-        frames=tuple(frames),
-        point_frames=point_frames,
-        camera_frames=_positions([frame_of[name] for name in names], frames),
-        query_frames=_positions([frame_of_query(q, context.frames) for q in queries], frames),
-        notes=tuple(notes),
-    )
-
-
-def render_view(scene: Scene) -> str:
-    """Render the page; it is self-contained and deterministic."""
-    failed = [query for query in scene.queries if query.cam_from_world is None]
-    arrays = {
-        to_camel(field.name): _encoded(value)
-        for field in fields(scene)
-        if isinstance(value := getattr(scene, field.name), np.ndarray)
-    }
     data = {
-        **arrays,
-        "origin": scene.origin.tolist(),
-        "up": np.round(scene.up, 9).tolist(),
-        "radius": scene.radius,
-        "cameras": scene.cameras,
+        "origin": origin.tolist(),
+        "up": np.round(up, 9).tolist(),
+        "radius": max(float(np.linalg.norm(high - low)) / 2, 1e-3),
+        "points": (points[:, :3] - origin).astype(np.float32),
+        "colors": _colors(points, up, mapping, kept),
+        "cameras": names,
+        "cameraFrusta": _frusta(poses, _rays(mapping, names, {}), origin),
         "queries": [
             {
                 "name": query.name,
@@ -258,25 +199,38 @@ def render_view(scene: Scene) -> str:
                 "error": query.position_m,
                 "confidence": query.confidence,
                 "inliers": query.num_inliers,
-                "drawn": drawn,
+                "drawn": len(xyz),
             }
-            for query, drawn in zip(scene.queries, scene.num_inliers, strict=True)
+            for query, xyz in zip(queries, inliers, strict=True)
         ],
-        "frames": scene.frames,
+        "frusta": _frusta([query.cam_from_world for query in queries], rays, origin),
+        "trueFrusta": _frusta([query.truth for query in queries], rays, origin),
+        "inliers": (np.concatenate([np.zeros((0, 3)), *inliers]) - origin).astype(np.float32),
+        "frames": frames,
+        "pointFrames": point_frames,
+        "cameraFrames": _positions([frame_of[name] for name in names], frames),
+        "queryFrames": _positions([frame_of_query(q, context.frames) for q in queries], frames),
     }
+    return data, notes
+
+
+def render_view(
+    title: str, data: Mapping[str, Any], queries: Sequence[QueryResult], notes: Sequence[str]
+) -> str:
+    """Render the page from the results of :func:`view_data`; self-contained and deterministic."""
     return template("view.html").render(
-        title=scene.title,
+        title=title,
         data=_script_data(data),
-        legend=legend(scene.queries),
+        legend=legend(queries[: len(data["queries"])]),
         counts={
-            "points": len(scene.points),
-            "cameras": len(scene.cameras),
-            "queries": len(scene.queries),
-            "failed": len(failed),
+            "points": len(data["points"]),
+            "cameras": len(data["cameras"]),
+            "queries": len(data["queries"]),
+            "failed": sum(query["color"] == NO_POSE_COLOR for query in data["queries"]),
         },
-        frames=scene.frames,
-        has_truth=bool(np.isfinite(scene.true_frusta).any()),
-        notes=scene.notes,
+        frames=data["frames"],
+        has_truth=bool(np.isfinite(data["trueFrusta"]).any()),
+        notes=notes,
     )
 
 
@@ -383,12 +337,16 @@ def _color_from_images(
             colors[drawn] = pixels[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
 
 
-def _encoded(array: NDArray[Any]) -> str:
-    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+def _encoded(value: Any) -> Any:
+    """Encode an array in base64, little-endian; leave other values as they are."""
+    if not isinstance(value, np.ndarray):
+        return value
+    little = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
     return base64.b64encode(little.tobytes()).decode("ascii")
 
 
 def _script_data(data: Mapping[str, Any]) -> Markup:
     """Return JSON that is safe in a script element, whatever names it contains."""
-    text = json.dumps(plain(data), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    encoded = {name: _encoded(value) for name, value in data.items()}
+    text = json.dumps(plain(encoded), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

@@ -361,16 +361,17 @@ def _confidence(evaluation: Evaluation, whose: str) -> Section:
 
 
 def _view(reported: Reported) -> str | None:
-    from megloc_kapture.evaluation.view import render_view, scene_of
+    from megloc_kapture.evaluation.view import render_view, view_data
 
     if len(reported.evaluations) > 1:
         return None
     (evaluation,) = reported.evaluations
     # a report without a view is better than none; `megloc view` reports the error
     with contextlib.suppress(DataError):
-        inliers = StoredInliers(evaluation.context)
-        scene = scene_of(evaluation.label or "Evaluation", inliers, shown_queries(evaluation))
-        return None if scene is None else render_view(scene)
+        queries = shown_queries(evaluation)
+        if (view := view_data(StoredInliers(evaluation.context), queries)) is not None:
+            data, notes = view
+            return render_view(evaluation.label or "Evaluation", data, queries, notes)
     return None
 
 

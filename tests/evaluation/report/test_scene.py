@@ -20,7 +20,7 @@ from megloc_kapture.evaluation import view as scenes
 from megloc_kapture.evaluation.report.queries import StoredInliers, legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
-from megloc_kapture.evaluation.view import Scene, render_view, scene_of
+from megloc_kapture.evaluation.view import render_view, view_data
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
@@ -83,11 +83,19 @@ def make_map(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-def drawn(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> Scene:
+View = tuple[dict[str, Any], list[str]]
+
+
+def drawn(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> View:
     mapping = KaptureFolder(root)
-    scene = scene_of(EVIL, StoredInliers(ResultContext(mapping=mapping, **context)), queries)
-    assert scene is not None
-    return scene
+    view = view_data(StoredInliers(ResultContext(mapping=mapping, **context)), queries)
+    assert view is not None
+    return view
+
+
+def page_of(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> str:
+    data, notes = drawn(root, queries, **context)
+    return render_view(EVIL, data, queries, notes)
 
 
 def evaluation_of(world: Any) -> Evaluation:
@@ -104,8 +112,7 @@ def test_view_data_are_those_of_the_map(make_map: Any, camera: Camera, offset: f
         [rng.normal((offset, 0, 0), 5, (50, 3)), rng.integers(0, 256, (50, 3))]
     )
     root = make_map([f"m/{k}.jpg" for k in range(6)], camera, points, offset)
-    scene = drawn(root)
-    data = data_of(render_view(scene))
+    data = data_of(page_of(root))
     # to float32 about the view's origin
     apart = 1 + np.abs(points[:, :3] - data["origin"]).max()
     shown = data["origin"] + data["points"]
@@ -127,12 +134,12 @@ def test_large_scenes_are_subsampled(make_map: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr(scenes, "MAX_CAMERAS", 10)
     monkeypatch.setattr(scenes, "MAX_POINTS", 600)
     root = make_map([f"m/{k:03d}.jpg" for k in range(30)], CAMERAS[0], points)
-    scene = drawn(root)
-    assert len(scene.cameras) == 10 and len(scene.points) == 600
-    assert "600 of the map's 900 points" in scene.notes[0]
-    assert "10 of the map's 30 cameras" in scene.notes[1]
-    known = {tuple(row) for row in np.float32(points[:, :3] - scene.origin).tolist()}
-    assert {tuple(row) for row in scene.points.tolist()} <= known
+    data, notes = drawn(root)
+    assert len(data["cameras"]) == 10 and len(data["points"]) == 600
+    assert "600 of the map's 900 points" in notes[0]
+    assert "10 of the map's 30 cameras" in notes[1]
+    known = {tuple(row) for row in np.float32(points[:, :3] - data["origin"]).tolist()}
+    assert {tuple(row) for row in data["points"].tolist()} <= known
 
 
 def test_names_are_escaped_in_the_view(world: Any, make_map: Any) -> None:
@@ -142,8 +149,9 @@ def test_names_are_escaped_in_the_view(world: Any, make_map: Any) -> None:
     world.conditions = dict.fromkeys(world.truth, EVIL)
     world.statuses[name] = LocalizationResult(name=name, reason=EVIL)
     evaluation = evaluation_of(world)
-    scene = drawn(root, shown_queries(evaluation))
-    page = render_view(replace(scene, cameras=(EVIL, "m/1.jpg")))
+    queries = shown_queries(evaluation)
+    data, notes = drawn(root, queries)
+    page = render_view(EVIL, data | {"cameras": [EVIL, "m/1.jpg"]}, queries, notes)
     # two scripts, of data and ours, whatever the names say
     assert page.count("<script") == page.count("</script>") == 2 and "alert('" not in page[:2000]
     data = data_of(page)
@@ -159,8 +167,7 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
     root = make_map()
     evaluation = evaluation_of(world)
     shown = shown_queries(evaluation)
-    scene = drawn(root, shown)
-    data = data_of(render_view(scene))
+    data = data_of(page_of(root, shown))
     by_image = {query.image: query for query in evaluation.queries}
     drawings = zip(data["queries"], data["frusta"], data["trueFrusta"], strict=True)
     for query, frustum, true in drawings:
@@ -199,14 +206,14 @@ def test_coordinate_frames_are_separate(world: Any, make_map: Any) -> None:
     ]
     floors = {name: ImageGroup(frame=f"DUC{1 + k // 2}") for k, name in enumerate(names)}
     write_groups(root / "tables", floors)
-    scene = drawn(root, shown, side_tables=root / "tables")
-    assert scene.frames == ("DUC1", "DUC2")
-    assert scene.point_frames.tolist() == [0, 1, 1]
-    assert scene.camera_frames.tolist() == [0, 0, 1, 1]
-    assert scene.query_frames.tolist() == [k % 2 for k in range(len(shown))]
-    assert "DUC2</option>" in render_view(scene)
-    assert 'id="frame"' not in render_view(drawn(root, shown))
-    assert scene_of("nothing", StoredInliers(ResultContext())) is None
+    data, _ = drawn(root, shown, side_tables=root / "tables")
+    assert data["frames"] == ["DUC1", "DUC2"]
+    assert data["pointFrames"].tolist() == [0, 1, 1]
+    assert data["cameraFrames"].tolist() == [0, 0, 1, 1]
+    assert data["queryFrames"].tolist() == [k % 2 for k in range(len(shown))]
+    assert "DUC2</option>" in page_of(root, shown, side_tables=root / "tables")
+    assert 'id="frame"' not in page_of(root, shown)
+    assert view_data(StoredInliers(ResultContext())) is None
 
 
 def test_points_without_colours_get_image_colours(make_map: Any) -> None:
@@ -223,7 +230,7 @@ def test_points_without_colours_get_image_colours(make_map: Any) -> None:
     for name, color in colors.items():
         pixels = np.full((480, 640, 3), color, np.uint8)
         write_image(root / "sensors/records_data" / name, pixels)
-    scene = drawn(root)
+    data, _ = drawn(root)
     expected = np.array([colors["m/0.jpg"], colors["m/0.jpg"], colors["m/1.jpg"]])
-    np.testing.assert_allclose(scene.colors[:3].astype(int), expected, atol=4)  # JPEG
-    assert np.ptp(scene.colors[3].astype(int)) < 70  # a grey: nothing observes it
+    np.testing.assert_allclose(data["colors"][:3].astype(int), expected, atol=4)  # JPEG
+    assert np.ptp(data["colors"][3].astype(int)) < 70  # a grey: nothing observes it
