@@ -142,10 +142,9 @@ def superpoint_rows(num: int, repeat: int) -> list[tuple[str, ...]]:
     def keypoints(
         dense: tuple[torch.Tensor, torch.Tensor],
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        pixels = select_pixels(
-            suppress_non_maxima(dense[0][0], 4), threshold=0.005, max_keypoints=num
-        )
-        return pixels.xy, pixels.scores, sample_descriptors(dense[1][0], pixels.xy, "official")
+        pixels, values = select_pixels(suppress_non_maxima(dense[0][0], 4), threshold=0.005)
+        scores, best = values.topk(min(num, len(values)))
+        return pixels[best], scores, sample_descriptors(dense[1][0], pixels[best], "official")
 
     with inference(CPU):
         seconds = time_alternately(

@@ -76,12 +76,12 @@ class Aliked(LocalNetwork[AlikedOptions]):
         self, net: AlikedNet, maps: AlikedMaps, mask: NDArray[np.bool_] | None
     ) -> LocalFeatures:
         options, scores = self.options, maps.scores
-        keypoints = select_pixels(
+        pixels, _ = select_pixels(
             suppress_non_maxima(scores, options.nms_radius),
             threshold=options.threshold,
             border=options.nms_radius,
         )
-        xy = soft_argmax(scores, keypoints.xy, options.nms_radius, _TEMPERATURE)
+        xy = soft_argmax(scores, pixels, options.nms_radius, _TEMPERATURE)
         height, width = scores.shape
         read = read_bilinear(scores.reshape(-1, 1), xy[:, 1], xy[:, 0], (height, width))
         # the first pixel's centre is (0, 0) in the network, (0.5, 0.5) in COLMAP

@@ -104,14 +104,14 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
     ) -> Level:
         options = self.options
         with inference(score_map.device):
-            candidates = select_pixels(
+            pixels, of_pixels = select_pixels(
                 suppress_non_maxima(score_map, options.nms_radius, rounds=0),
                 threshold=options.threshold,
                 border=_BORDER_PX,
             )
-            kept = on_no_edge(score_map, candidates.xy, options.max_edge_ratio)
-            xy = parabola_peak(score_map, candidates.xy[kept])
-            scores = candidates.scores[kept]
+            kept = on_no_edge(score_map, pixels, options.max_edge_ratio)
+            xy = parabola_peak(score_map, pixels[kept])
+            scores = of_pixels[kept]
             coarse = features.shape[1], features.shape[2]
             x, y = (xy / STRIDE).unbind(1)
             # _BORDER_PX keeps keypoints inside the descriptor map
@@ -178,8 +178,8 @@ class AslFeatNet(nn.Module):
 
     def _deformable(self, name: str, x: torch.Tensor) -> torch.Tensor:
         conv: _Conv = getattr(self, name)
-        sampling = self.deform_param[name]
-        offset, amplitude = sampling["offset"](x), torch.sigmoid(sampling["amplitude"](x))
+        offset = self.get_submodule(f"deform_param.{name}.offset")(x)
+        amplitude = torch.sigmoid(self.get_submodule(f"deform_param.{name}.amplitude")(x))
         if conv.bn is None:
             return deform_conv2d(x, offset, conv.weight, None, amplitude)
         weight, bias = conv.bn.folded_into(conv.weight)

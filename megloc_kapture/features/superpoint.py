@@ -9,6 +9,7 @@ come from a second checkpoint: MegLoc fine-tunes them with a frozen detector.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -97,22 +98,24 @@ class SuperPoint(LocalNetwork[SuperPointOptions]):
         with inference(device, options.half_precision):
             scores, descriptors = net(torch.cat([gray_tensor(image, device) for image in images]))
             maxima = suppress_non_maxima(scores, options.nms_radius)
-            for k, mask in enumerate(masks):
-                keypoints = select_pixels(
-                    maxima[k],
-                    threshold=options.threshold,
-                    border=options.remove_borders,
-                    mask=mask,
-                    max_keypoints=options.max_keypoints,
+            for of_image, described, mask in zip(maxima, descriptors, masks, strict=True):
+                xy, of_pixels = select_pixels(
+                    of_image, threshold=options.threshold, border=options.remove_borders
                 )
-                sampled = sample_descriptors(descriptors[k], keypoints.xy, sampling).cpu().numpy()
-                values = keypoints.scores.cpu().numpy()
                 # the first pixel's centre is (0, 0) in the network, (0.5, 0.5) in COLMAP
-                xy = keypoints.xy.cpu().numpy().astype(np.float32) + np.float32(0.5)
-                table = np.column_stack([xy, values])
-                sampled = np.ascontiguousarray(sampled)
-                features.append(LocalFeatures(table, values, sampled, keypoints.num_masked))
+                xy_px = xy.cpu().numpy().astype(np.float32) + np.float32(0.5)
+                values = of_pixels.cpu().numpy()
+                describe = partial(_describe, described, xy, sampling)
+                features.append(
+                    self._best(np.column_stack([xy_px, values]), values, describe, mask)
+                )
         return features
+
+
+def _describe(
+    descriptors: torch.Tensor, xy: torch.Tensor, sampling: DescriptorSampling, rows: torch.Tensor
+) -> torch.Tensor:
+    return sample_descriptors(descriptors, xy[rows.to(xy.device)], sampling).contiguous()
 
 
 def gray_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:

@@ -14,27 +14,13 @@ than ``grid_sample``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.nn import functional
 
 CELL_PX = 8
 _EDGE_STEP = 3  # pixels between the samples of the edge test's second differences
 # number of values gathered at once: fits the cache of a CPU, and occupies a GPU
 _VALUES_AT_ONCE = {"cpu": 1 << 20, "cuda": 1 << 27}
-
-
-@dataclass(frozen=True, eq=False)
-class SelectedPixels:
-    """Pixels of one score map, best first; ties are sorted by y, then x."""
-
-    # xy: int64 (N, 2), columns and rows of the map; scores: (N,)
-    xy: torch.Tensor
-    scores: torch.Tensor
-    num_masked: int
 
 
 def pixel_scores(logits: torch.Tensor) -> torch.Tensor:
@@ -84,35 +70,17 @@ def suppress_non_maxima(scores: torch.Tensor, radius: int, *, rounds: int = 2) -
 
 
 def select_pixels(
-    scores: torch.Tensor,
-    *,
-    threshold: float,
-    border: int = 0,
-    mask: NDArray[np.bool_] | None = None,
-    max_keypoints: int | None = None,
-) -> SelectedPixels:
-    """Select the best unmasked pixels of a score map.
+    scores: torch.Tensor, *, threshold: float, border: int = 0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Select the pixels of a score map (H, W) above a threshold, row by row.
 
-    Parameters
-    ----------
-    scores : (H, W), after non-maximum suppression.
-    threshold : lower bound (exclusive).
-    border : width of the map's border without candidates, in pixels.
-    mask : bool (H or more, W or more), True = use, applied before the selection.
-    max_keypoints : None keeps all.
+    Return columns and rows, int64 (N, 2), and scores (N,). The outer ``border`` pixels of the map
+    are never selected.
     """
     height, width = scores.shape
     inner = scores[border : max(height - border, border), border : max(width - border, border)]
-    yx = torch.nonzero(inner > threshold) + border  # sorted by y, then x
-    num_masked = 0
-    if mask is not None:
-        allowed = torch.from_numpy(np.ascontiguousarray(mask[:height, :width])).to(scores.device)
-        usable = allowed[yx[:, 0], yx[:, 1]]
-        num_masked = len(yx) - int(usable.sum())
-        yx = yx[usable]
-    values = scores[yx[:, 0], yx[:, 1]]
-    order = torch.sort(values, descending=True, stable=True).indices[:max_keypoints]
-    return SelectedPixels(yx[order].flip(1), values[order], num_masked)
+    y, x = (torch.nonzero(inner > threshold) + border).unbind(1)
+    return torch.stack([x, y], dim=1), scores[y, x]
 
 
 def soft_argmax(

@@ -70,7 +70,7 @@ class SuperGlueNet(nn.Module):
             located = torch.column_stack([torch.cat([image.xy for image in images]), scores])
             encoded = self.kenc["encoder"](located)
             tokens = torch.cat([image.descriptors for image in images]) + encoded
-        for number, layer in enumerate(self.gnn["layers"], start=1):
+        for number, layer in enumerate(self.gnn["layers"].children(), start=1):
             tokens = tokens + layer(tokens, lengths, cross=number % 2 == 0)
         with torch.autocast(device, enabled=False):
             sides = torch.split(self.final_proj(tokens), lengths)

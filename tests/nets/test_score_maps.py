@@ -48,33 +48,18 @@ def test_suppression_equals_its_definition(radius: int, rounds: int) -> None:
     np.testing.assert_array_equal(result[0].numpy(), by_definition(scores, radius, rounds))
 
 
-def test_the_best_come_first_and_ties_by_y_then_x() -> None:
+def test_pixels_above_the_threshold_are_selected_by_rows() -> None:
     scores = torch.zeros(6, 7)
     scores[4, 1] = scores[2, 5] = scores[2, 3] = 0.5
     scores[5, 6] = 0.9
     scores[0, 0] = 0.1
-    result = select_pixels(scores, threshold=0.1)  # the threshold itself is too little
-    assert result.xy.tolist() == [[6, 5], [3, 2], [5, 2], [1, 4]]
-    assert result.scores.tolist() == pytest.approx([0.9, 0.5, 0.5, 0.5])
-    assert select_pixels(scores, threshold=0.1, max_keypoints=2).xy.tolist() == [[6, 5], [3, 2]]
+    xy, values = select_pixels(scores, threshold=0.1)  # the threshold itself is too little
+    assert xy.tolist() == [[3, 2], [5, 2], [1, 4], [6, 5]]
+    assert values.tolist() == pytest.approx([0.5, 0.5, 0.5, 0.9])
     # borders hold no keypoints
-    inner = select_pixels(torch.ones(9, 7), threshold=0.0, border=3)
-    assert inner.xy.tolist() == [[3, 3], [3, 4], [3, 5]]
-    assert len(select_pixels(torch.ones(9, 7), threshold=0.0, border=4).xy) == 0
-
-
-def test_the_mask_comes_before_the_choice_of_the_best() -> None:
-    scores = torch.from_numpy(random_scores(1, (8, 8)))
-    mask = np.ones((11, 10), bool)  # of an image that is not a multiple of 8
-    best = select_pixels(scores, threshold=0.5, mask=mask, max_keypoints=6)
-    assert best.num_masked == 0
-    for x, y in best.xy[:4].tolist():
-        mask[y, x] = False
-    mask[8:], mask[:, 8:] = False, False  # holds no scores
-    result = select_pixels(scores, threshold=0.5, mask=mask, max_keypoints=6)
-    assert result.num_masked == 4
-    everything = select_pixels(scores, threshold=0.5)
-    assert result.xy.tolist() == everything.xy[4:10].tolist()
+    inner, _ = select_pixels(torch.ones(9, 7), threshold=0.0, border=3)
+    assert inner.tolist() == [[3, 3], [3, 4], [3, 5]]
+    assert len(select_pixels(torch.ones(9, 7), threshold=0.0, border=4)[0]) == 0
 
 
 def test_bilinear_reading_equals_grid_sample_inside_and_outside() -> None:
