@@ -28,13 +28,10 @@ from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import image_rows
-from megloc_kapture.io.dataset_tables import (
-    MAX_QUATERNION_NORM_ERROR,
-    PoseFileFormat,
-    PoseFileNames,
-)
+from megloc_kapture.io.dataset_tables import PoseFileFormat, PoseFileNames
 from megloc_kapture.io.files import named, read_content, read_json_model, read_text, write_json
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import RigidTransform
 
 _log = logging.getLogger(__name__)
@@ -218,13 +215,8 @@ def checked_pose(
     require(
         all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)), f"{whose}: the pose is not finite"
     )
-    norm = math.sqrt(sum(q * q for q in quat_wxyz))
-    if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
-        raise DataError(f"{whose}: quaternion of length {norm:g}, not 1")
-    if abs(norm - 1.0) > 1e-12:
-        w, x, y, z = (q / norm for q in quat_wxyz)
-        quat_wxyz = (w, x, y, z)
-    return RigidTransform(quat_wxyz, translation)
+    with named(about=whose):
+        return RigidTransform(unit_quaternion(quat_wxyz), translation)
 
 
 def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> RigidTransform:

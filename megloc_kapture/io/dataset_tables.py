@@ -18,7 +18,6 @@ metres. Without protocol.json, the defaults of :class:`Protocol` hold.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +26,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import ImageName, columns_of, read_records, write_csv_table
 from megloc_kapture.io.files import (
     ModelT,
@@ -35,6 +35,7 @@ from megloc_kapture.io.files import (
     write_bytes,
     write_json_model,
 )
+from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.io.text_lines import reading_lines
 from megloc_kapture.values import Options, RigidTransform
 
@@ -50,9 +51,6 @@ UNREGISTERED_FILE = "unregistered.csv"
 NOWHERE_FILE = "nowhere.txt"
 # units of the local frame; NO_METRES is that of a map of unknown scale
 METRES, NO_METRES = "m", "units"
-
-# a quaternion's length may differ from 1 by less than this; it is then normalised
-MAX_QUATERNION_NORM_ERROR = 1e-3
 
 PoseFileNames = Literal["full", "basename"]
 PoseFileFormat = Literal["ltvl", "mlad"]
@@ -79,11 +77,11 @@ class SimilarityTransform(Options):
 
     @field_validator("quat_wxyz")
     @classmethod
-    def _unit(cls, quat: tuple[float, ...]) -> tuple[float, ...]:
-        norm = math.sqrt(sum(q * q for q in quat))
-        if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
-            raise ValueError(f"quaternion of length {norm:g}, not 1")
-        return tuple(q / norm for q in quat) if abs(norm - 1.0) > 1e-12 else quat
+    def _unit(cls, quat: tuple[float, float, float, float]) -> tuple[float, ...]:
+        try:
+            return unit_quaternion(quat)
+        except DataError as error:
+            raise ValueError(error.message) from error
 
     def rotation(self) -> RigidTransform:
         return RigidTransform(self.quat_wxyz, (0.0, 0.0, 0.0))

@@ -141,12 +141,9 @@ def fit_to_surface(
 
     Return None without correspondences within ``max_distance_m``.
     """
-    start = np.eye(4)
-    start[:3, :3] = surface_from_points.rotation_matrix()
-    start[:3, 3] = surface_from_points.translation
     cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
     result = small_gicp.align(
-        *(surface._cloud, cloud, surface._tree, start),
+        *(surface._cloud, cloud, surface._tree, surface_from_points.matrix()),
         registration_type="PLANE_ICP",
         max_correspondence_distance=max_distance_m,
         max_iterations=_MAX_ITERATIONS,

@@ -137,7 +137,7 @@ GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
         ("b.jpg 1 0 0 0 1.5 -0.2", "columns", "7 columns instead of 8 (name qw qx qy qz tx ty tz)"),
         ("b.jpg, 0.6, 0.8, 0, 0, 1.5, -0.2", "columns", "separated by blanks, not commas"),
         ("# name qw qx qy qz tx ty tz", "comment", "no header"),
-        ("b.jpg 0 0 0 0 1 -0.2 3", "pose", "b.jpg: quaternion of length 0, not 1"),
+        ("b.jpg 0 0 0 0 1 -0.2 3", "pose", "b.jpg: rotation is not a unit quaternion (length 0)"),
         ("b.jpg 10 20 30 0.6 0.8 0 0", "pose", "the columns are name qw qx qy qz tx ty tz"),
         ("a.jpg 1 0 0 0 1 -0.2 3", "duplicate", "given twice, first on line 1"),
     ],
