@@ -234,10 +234,10 @@ class Render(Working):
         with single_threaded():
             field = open_field(self.field)
             light = None if self.appearance is None else field.appearance_of(self.appearance)
-            rendered = field.render(camera, pose, appearance=light)
+            rendered, depth_m = field.render(camera, pose, appearance=light)
         write_image(self.output, rendered.image)
         if self.depth is not None:
-            stored = np.clip(np.round(rendered.depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
+            stored = np.clip(np.round(depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
             write_bytes(self.depth, cv2.imencode(".png", stored)[1].tobytes())
 
 

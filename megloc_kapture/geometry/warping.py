@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """A map image uint8 (H, W, 3) with its pose, and optional depth and mask (H, W), True = use.
+    """An image uint8 (H, W, 3) with a pose, and optional depth and mask (H, W), True = use.
 
     The depth map may be from another camera.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePosixPath
 from threading import Lock
 from typing import Literal
@@ -23,6 +23,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import pixel_rays, reduced_camera
 from megloc_kapture.geometry.warping import PosedImage, warp_to_view
 from megloc_kapture.nets.radiance import NerfW, Rays, Rendered, TriPlane
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Kind = Literal["triplane", "nerfw"]
@@ -45,14 +46,6 @@ class FieldFrame(Options):
     scale: float = Field(gt=0)
     near: float = Field(gt=0)
     far: float = Field(gt=0)
-
-
-@dataclass(frozen=True, eq=False)
-class FieldRendering:
-    image: NDArray[np.uint8]  # uint8 (H, W, 3), RGB
-    # float32 (H, W) along the optical axis, unit of the map; 0 where mostly empty
-    depth_m: Floats
-    camera: Camera  # the view's camera at reduced size
 
 
 def build_field(kind: Kind, num_images: int, num_lights: int) -> FieldModule:
@@ -107,14 +100,20 @@ class NeuralField:
         *,
         appearance: torch.Tensor | None = None,
         max_side_px: int | None = None,
-    ) -> FieldRendering:
-        """Render a view without transient objects; ``appearance`` (A,) is the mean by default."""
+    ) -> tuple[PosedImage, Floats]:
+        """Render a view without transient objects; ``appearance`` (A,) is the mean by default.
+
+        The camera is reduced to ``max_side_px``. Also returns the depth, float32 (H, W) along the
+        optical axis in the map's unit; 0 where mostly empty.
+        """
         camera = reduced_camera(camera, max_side_px or max(camera.width, camera.height))
         shape = camera.height, camera.width
         rendered = self.render_rays(self.rays(camera, cam_from_world), appearance)
         rgb = (rendered.rgb * 255).round().clamp(0, 255).byte().cpu().numpy().reshape(*shape, 3)
-        depth_m = torch.where(rendered.opacity > 0.5, rendered.depth, 0.0).cpu().numpy()
-        return FieldRendering(rgb, depth_m.reshape(shape).astype(np.float32), camera)
+        depth = torch.where(rendered.opacity > 0.5, rendered.depth, 0.0).cpu().numpy()
+        depth_m = depth.reshape(shape).astype(np.float32)
+        view = DepthView(camera, depth_m, RigidTransform.identity())
+        return PosedImage(rgb, camera, cam_from_world, view), depth_m
 
     def render_rays(self, rays: Rays, appearance: torch.Tensor | None = None) -> Rendered:
         parts, size = [], _CPU_CHUNK if self.device.type == "cpu" else _CHUNK

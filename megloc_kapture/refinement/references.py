@@ -28,7 +28,7 @@ from megloc_kapture.refinement.pyramid import (
     lift_points,
     visibility,
 )
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
 # held-out images: largest and smallest number of displacements (five are all above the true median
@@ -84,19 +84,12 @@ class ReferenceImages:
         return [self.names[row] for row in chosen]
 
 
-@dataclass(frozen=True, eq=False)
-class RenderingQuery:
-    image: NDArray[np.uint8]
-    camera: Camera
-    mask: NDArray[np.bool_] | None = None
-
-
 def lifted(reference: PosedImage) -> DepthPoints:
     assert reference.depth is not None
     return lift_points(reference.camera, reference.cam_from_world, reference.depth)
 
 
-def pyramid_of(view: RenderingQuery | PosedImage, options: RenderingOptions) -> list[Level]:
+def pyramid_of(view: PosedImage, options: RenderingOptions) -> list[Level]:
     """Build the pyramid of an image, finest first."""
     image, camera = view.image, view.camera
     if image.shape != (camera.height, camera.width, 3):

@@ -33,7 +33,6 @@ from megloc_kapture.refinement.pyramid import Seen, choose_points, usable_cells,
 from megloc_kapture.refinement.references import (
     Displacement,
     ReferenceImages,
-    RenderingQuery,
     lifted,
     pyramid_of,
     references_elsewhere,
@@ -51,10 +50,7 @@ _CLEAR = 4.0
 
 
 def refine_by_rendering(
-    query: RenderingQuery,
-    references: Sequence[PosedImage],
-    cam_from_world: RigidTransform,
-    options: RenderingOptions | None = None,
+    query: PosedImage, references: Sequence[PosedImage], options: RenderingOptions | None = None
 ) -> PoseRefinement:
     """Refine the pose of an image, in metres, by warping references with depth into it.
 
@@ -63,13 +59,12 @@ def refine_by_rendering(
     references; if the pose is determined, standard deviations and the squared Mahalanobis distance.
     """
     options = options or RenderingOptions()
-    return _Refining(query, references, options).refine(cam_from_world)
+    return _Refining(query, references, options).refine()
 
 
 def judge_by_rendering(
-    query: RenderingQuery,
+    query: PosedImage,
     references: Sequence[PosedImage],
-    start: RigidTransform,
     refined: RigidTransform,
     options: RenderingOptions,
     *,
@@ -79,25 +74,21 @@ def judge_by_rendering(
 
     ``judged`` bool (H, W) are the query's pixels that acceptance uses, by default all.
     """
-    return _Refining(query, references, options).judge(start, refined, judged)
+    return _Refining(query, references, options).judge(refined, judged)
 
 
 def displacement_by_rendering(
-    query: RenderingQuery,
-    references: Sequence[PosedImage],
-    cam_from_world: RigidTransform,
-    options: RenderingOptions | None = None,
+    image: PosedImage, references: Sequence[PosedImage], options: RenderingOptions
 ) -> Displacement | None:
     """Return how far :func:`refine_by_rendering` moves a presumably correct pose.
 
     If the result is rejected, the displacement is that of the nearest minimum. None if overlap or
     correlation is too small, the images do not determine the pose, or the minimum is out of bounds.
     """
-    options = options or RenderingOptions()
-    refiner = _Refining(query, references, options)
-    refined = refiner.refine(cam_from_world)
+    refiner = _Refining(image, references, options)
+    refined = refiner.refine()
     if not refined.accepted:
-        refined = refiner.judge(cam_from_world, cam_from_world, None)
+        refined = refiner.judge(image.cam_from_world, None)
     result = refined.measures
     if "squared_distance" not in result or (
         result["moved_m"] > options.max_translation_m
@@ -110,42 +101,38 @@ def displacement_by_rendering(
 
 class _Refining:
     def __init__(
-        self,
-        query: RenderingQuery,
-        references: Sequence[PosedImage],
-        options: RenderingOptions,
+        self, query: PosedImage, references: Sequence[PosedImage], options: RenderingOptions
     ) -> None:
         self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
-        self.camera = query.camera
+        self.camera, self.start = query.camera, query.cam_from_world
         self.query_levels = pyramid_of(query, options)
         self.levels = [pyramid_of(each, options) for each in references]
         self.points = [lifted(each) for each in references]
 
-    def refine(self, start: RigidTransform) -> PoseRefinement:
+    def refine(self) -> PoseRefinement:
+        start = self.start
         seen, overlap = self._visibility(start)
         if overlap < self.least_overlap:
             return _uncovered(start, overlap)
         coarsest = min([len(self.query_levels), *map(len, self.levels)]) - 1
-        searched = self._decide(start, overlap, self._align_from_search(coarsest, start, seen))
+        searched = self._decide(overlap, self._align_from_search(coarsest, start, seen))
         clear = searched.accepted and searched.measures["significance"] >= _CLEAR
         if clear or coarsest == 0:
             return searched
         # the best perturbed pose may lead away from a nearly correct pose
-        direct = self._decide(start, overlap, self._align(0, start, seen))
+        direct = self._decide(overlap, self._align(0, start, seen))
         if not searched.accepted:
             return direct if direct.accepted else searched
         return max((direct, searched), key=lambda each: each.measures.get("correlation_after", -1))
 
-    def judge(
-        self, start: RigidTransform, pose: RigidTransform, judged: NDArray[np.bool_] | None
-    ) -> PoseRefinement:
+    def judge(self, pose: RigidTransform, judged: NDArray[np.bool_] | None) -> PoseRefinement:
         seen, overlap = self._visibility(pose)
         if overlap < self.least_overlap:
-            return _uncovered(start, overlap)
+            return _uncovered(self.start, overlap)
         candidate = self._align(0, pose, seen)
         if candidate is not None and judged is not None:
             candidate = replace(candidate, problem=candidate.problem.within(judged))
-        return self._decide(start, overlap, candidate)
+        return self._decide(overlap, candidate)
 
     def _visibility(self, pose: RigidTransform) -> tuple[Seen, float]:
         """Return the visible points, and the share of the query that they cover."""
@@ -196,14 +183,12 @@ class _Refining:
         tried = [minimise(fewer, each, last_step_px=_COARSE_STEP_PX, rounds=1) for each in starts]
         return max(tried, key=partial(correlation, fewer)).cam_from_world
 
-    def _decide(
-        self, start: RigidTransform, old_overlap: float, candidate: Candidate | None
-    ) -> PoseRefinement:
+    def _decide(self, old_overlap: float, candidate: Candidate | None) -> PoseRefinement:
         if candidate is None:
             reason = f"fewer than {MIN_POINTS} points to compare"
-            return PoseRefinement(start, reason, {"overlap_before": old_overlap})
+            return PoseRefinement(self.start, reason, {"overlap_before": old_overlap})
         _, overlap = self._visibility(candidate.alignment.cam_from_world)
-        return accept_or_keep(start, candidate, (old_overlap, overlap), self.options)
+        return accept_or_keep(self.start, candidate, (old_overlap, overlap), self.options)
 
 
 def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
@@ -230,9 +215,8 @@ class Rendering:
         references = references_elsewhere(view, images, scene)[: self.options.max_references]
         if not references:
             return None
-        query = RenderingQuery(view.image, view.camera, view.mask)
         options = self.options.model_copy(update={"accept_always": False})
-        return displacement_by_rendering(query, references, view.cam_from_world, options)
+        return displacement_by_rendering(view, references, options)
 
     def refine(
         self,
@@ -250,5 +234,6 @@ class Rendering:
                 used.append(reference)
         if not used:
             return PoseRefinement(cam_from_world, "no reference image has depth")
-        view = RenderingQuery(scene.query_image(query), camera, scene.query_mask(query))
-        return refine_by_rendering(view, used, cam_from_world, self.options)
+        image, mask = scene.query_image(query), scene.query_mask(query)
+        posed = PosedImage(image, camera, cam_from_world, mask=mask)
+        return refine_by_rendering(posed, used, self.options)

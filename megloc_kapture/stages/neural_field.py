@@ -39,7 +39,6 @@ from megloc_kapture.plugin_loading import Placement, load_chosen, weights_of
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
-    DepthView,
     LocalFeatureExtractor,
     Matcher,
     PluginChoice,
@@ -50,13 +49,11 @@ from megloc_kapture.refinement.acceptance import RenderingOptions
 from megloc_kapture.refinement.field_training import FieldTrainer, FieldTrainingOptions
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
-    FieldRendering,
     Kind,
     NeuralField,
     build_field,
     light_rows,
 )
-from megloc_kapture.refinement.references import RenderingQuery
 from megloc_kapture.refinement.rendering import judge_by_rendering
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import HERE, Work
@@ -198,13 +195,14 @@ class _Renderer:
         name, camera, pose = view
         field = open_field(self.field, self.options.device)
         light = None if self.appearance is None else field.appearance_of(self.appearance)
-        rendered = field.render(camera, pose, appearance=light, max_side_px=self.max_side_px)
-        if np.mean(rendered.depth_m > 0) < self.min_shown:
+        side = self.max_side_px
+        rendered, depth_m = field.render(camera, pose, appearance=light, max_side_px=side)
+        if np.mean(depth_m > 0) < self.min_shown:
             return None
         image, depth = (self.records / part for part in _files_of(name))
         image.parent.mkdir(parents=True, exist_ok=True)
         write_image(image, rendered.image)
-        write_depth_map(depth, rendered.depth_m)
+        write_depth_map(depth, depth_m)
         return rendered.camera
 
 
@@ -338,11 +336,11 @@ class FieldRefiner:
             return field.fitted_appearance(PosedImage(image, camera, pose, mask=used), side)
 
         light = light_at(cam_from_world)
-        first = field.render(camera, cam_from_world, appearance=light, max_side_px=side)
-        solved = self._solve(self._extract(image, mask, first.camera), first, cam_from_world)
+        first, depth_m = field.render(camera, cam_from_world, appearance=light, max_side_px=side)
+        solved = self._solve(self._extract(image, mask, first.camera), first, depth_m)
         if isinstance(solved, Failure):
             return PoseRefinement(cam_from_world, f"query and rendering: {solved.reason}")
-        seen = RenderingQuery(image, camera, mask)
+        seen = PosedImage(image, camera, cam_from_world, mask=mask)
         options = RenderingOptions(
             appearance="colours",
             max_side_px=side,
@@ -352,12 +350,8 @@ class FieldRefiner:
         )
         pose, light = solved, light_at(solved)
         for _ in range(_ALIGNMENTS):
-            shown = field.render(camera, pose, appearance=light, max_side_px=side)
-            depth = DepthView(shown.camera, shown.depth_m, RigidTransform.identity())
-            reference = PosedImage(shown.image, shown.camera, pose, depth)
-            judged = judge_by_rendering(
-                seen, [reference], cam_from_world, pose, options, judged=~fitted
-            )
+            shown, _ = field.render(camera, pose, appearance=light, max_side_px=side)
+            judged = judge_by_rendering(seen, [shown], pose, options, judged=~fitted)
             if not judged.accepted:
                 break
             pose = judged.cam_from_world
@@ -375,18 +369,18 @@ class FieldRefiner:
         return ImageFeatures(features.keypoints_px, features.descriptors, *size)
 
     def _solve(
-        self, query: ImageFeatures, rendering: FieldRendering, pose: RigidTransform
+        self, query: ImageFeatures, rendering: PosedImage, depth_m: NDArray[np.float32]
     ) -> RigidTransform | Failure:
-        shown = self._extract(rendering.image, rendering.depth_m > 0, rendering.camera)
+        shown = self._extract(rendering.image, depth_m > 0, rendering.camera)
         rows, _ = self._matcher.match(query, shown)
         px = shown.keypoints_px[rows[:, 1], :2].astype(np.float64)
-        depth = sample_depth(rendering.depth_m, px, _MAX_JUMP, whole=True)
+        depth = sample_depth(depth_m, px, _MAX_JUMP, whole=True)
         known = np.isfinite(depth)
         in_cam = bearing_rays(rendering.camera, px[known]) * depth[known, None]
         options = AbsolutePoseOptions(max_error_px=_MAX_ERROR_PX)
         solution = absolute_pose(
             query.keypoints_px[rows[known, 0], :2],
-            pose.inverse().apply(in_cam),
+            rendering.cam_from_world.inverse().apply(in_cam),
             rendering.camera,
             options,
         )

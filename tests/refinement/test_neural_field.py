@@ -75,7 +75,7 @@ def depth_error(field: NeuralField, tests: list[PosedImage]) -> float:
     for view in tests:
         assert view.depth is not None
         known = view.depth.depth_m
-        result = field.render(view.camera, view.cam_from_world).depth_m
+        _, result = field.render(view.camera, view.cam_from_world)
         errors.append(np.abs(result - known) / known)
     return float(np.median(errors))
 
@@ -106,7 +106,7 @@ def test_half_precision_learns_nearly_the_same() -> None:
     fields = [train_field(views(5), each)[0] for each in (brief, half)]
     exact, near = (field.module.state_dict() for field in fields)
     assert any(not torch.equal(exact[name], near[name]) for name in exact)
-    images = [field.render(SMALL, IDENTITY).image for field in fields]
+    images = [field.render(SMALL, IDENTITY)[0].image for field in fields]
     assert np.abs(np.subtract(*np.float64(images))).mean() < 8
 
 

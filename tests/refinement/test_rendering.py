@@ -18,7 +18,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.acceptance import RenderingOptions
-from megloc_kapture.refinement.references import RenderingQuery
 from megloc_kapture.refinement.rendering import Rendering, _Refining, refine_by_rendering
 from megloc_kapture.values import RigidTransform
 
@@ -27,7 +26,7 @@ HERE = RigidTransform.identity()
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    query: RenderingQuery
+    query: PosedImage
     truth: RigidTransform
     references: tuple[PosedImage, ...]
 
@@ -51,13 +50,14 @@ def case() -> Case:
         pose_at((0.0, 0.3, 0.4), 4, -1),
         pose_at((-0.2, -0.2, -0.5), 2, 4),
     )
-    query = RenderingQuery(at_night(render(truth)), CAMERA)
+    query = PosedImage(at_night(render(truth)), CAMERA, truth)
     return Case(query, truth, tuple(map(reference, near)))
 
 
 def run(case: Case, start: RigidTransform, **options: object) -> PoseRefinement:
     chosen = RenderingOptions.model_validate(options)
-    return refine_by_rendering(case.query, case.references, start, chosen)
+    query = replace(case.query, cam_from_world=start)
+    return refine_by_rendering(query, case.references, chosen)
 
 
 def assert_accurate(refined: PoseRefinement, truth: RigidTransform, m: float, deg: float) -> None:
@@ -152,7 +152,7 @@ def test_the_plugin_takes_the_first_references_that_have_depth(case: Case) -> No
     assert refine(["flat"]).reason == "no reference image has depth" and not scene.asked
     refined = refine(["flat", "0", "1", "2"])
     assert scene.asked == ["0", "1", "query"]
-    direct = refine_by_rendering(case.query, case.references[:2], start)
+    direct = refine_by_rendering(replace(case.query, cam_from_world=start), case.references[:2])
     assert refined.cam_from_world == direct.cam_from_world and refined.accepted
     with pytest.raises(DataError, match="does not fit a camera"):
         run(showing(case, case.query.image[:100]), start)

@@ -21,8 +21,6 @@ from megloc_kapture.values import Camera, RigidTransform
 pytest.importorskip("torch")
 
 from megloc_kapture.refinement.acceptance import RenderingOptions  # noqa: E402
-from megloc_kapture.refinement.neural_field import FieldRendering  # noqa: E402
-from megloc_kapture.refinement.references import RenderingQuery  # noqa: E402
 from megloc_kapture.refinement.rendering import judge_by_rendering  # noqa: E402
 from megloc_kapture.stages import neural_field  # noqa: E402
 
@@ -49,9 +47,12 @@ class ExactField:
     def fitted_appearance(self, *_: Any) -> None:
         return None
 
-    def render(self, camera: Camera, pose: RigidTransform, **_: Any) -> FieldRendering:
+    def render(
+        self, camera: Camera, pose: RigidTransform, **_: Any
+    ) -> tuple[PosedImage, NDArray[np.float32]]:
         seen = room.render(pose, camera=camera)
-        return FieldRendering(seen.image, seen.depth_m, camera)
+        depth = DepthView(camera, seen.depth_m, IDENTITY)
+        return PosedImage(seen.image, camera, pose, depth), seen.depth_m
 
 
 def refined(
@@ -120,9 +121,9 @@ def test_appearance_and_acceptance_use_different_halves_of_the_image(
     reference = PosedImage(image, LARGER, truth, DepthView(LARGER, depth, IDENTITY))
     options = RenderingOptions(levels=1)
     noise = np.random.default_rng(0).integers(0, 255, image.shape, np.uint8)
-    query = RenderingQuery(np.where(half[..., None], noise, image), LARGER)
+    query = PosedImage(np.where(half[..., None], noise, image), LARGER, start)
     by_one, by_other, by_all = (
-        judge_by_rendering(query, [reference], start, truth, options, judged=which)
+        judge_by_rendering(query, [reference], truth, options, judged=which)
         for which in (~half, half, None)
     )
     assert by_one.accepted and not by_other.accepted, (by_one, by_other)
