@@ -18,7 +18,6 @@ from pydantic import Field
 from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import (
     Images,
     Level,
@@ -242,15 +241,7 @@ def _deformation(channels: int) -> nn.ModuleDict:
 
 def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
     """Build the network from a converted checkpoint, in eval mode."""
-    net = AslFeatNet()
-    load_strictly(net, tensors, where)
-    for name in _SCORED:
-        scale = float(net.get_buffer(f"tower.{name}.instance_max"))
-        if not 0 < scale < float("inf"):
-            raise DataError(
-                f"tower/{name}/instance_max is {scale}, not a positive number", path=where
-            )
-    return net.eval()
+    return load_strictly(AslFeatNet(), tensors, where).eval()
 
 
 def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ Parameters have the names of the authors' checkpoints, with additions by
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -117,10 +117,7 @@ def netvlad(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
             path=where,
         )
     rest = dict(tensors)
-    mean = rest.pop(_AVERAGE_IMAGE)
-    if mean.shape != (3,):
-        raise DataError(f"{_AVERAGE_IMAGE} is {tuple(mean.shape)}, not (3,)", path=where)
-    red, green, blue = (float(value) for value in mean)
+    red, green, blue = rest.pop(_AVERAGE_IMAGE).tolist()
     return _filled(rest, where, "dk", (red, green, blue))
 
 
@@ -169,8 +166,8 @@ class ApGemNet(ResNet):
         self,
         depth: Depth = 101,
         *,
-        mean: Iterable[float] = IMAGENET_MEAN,
-        deviation: Iterable[float] = IMAGENET_DEVIATION,
+        mean: torch.Tensor | Sequence[float] = IMAGENET_MEAN,
+        deviation: torch.Tensor | Sequence[float] = IMAGENET_DEVIATION,
         normalised_features: bool = False,
     ) -> None:
         super().__init__(depth)
@@ -178,7 +175,9 @@ class ApGemNet(ResNet):
         self.fc = nn.Linear(DESCRIPTOR_SIZE, DESCRIPTOR_SIZE)
         self.normalised_features = normalised_features
         for name, values in (("mean", mean), ("deviation", deviation)):
-            self.register_buffer(name, torch.tensor(list(values)).view(3, 1, 1), persistent=False)
+            self.register_buffer(
+                name, torch.as_tensor(values).float().view(3, 1, 1), persistent=False
+            )
 
     def describe(self, image: torch.Tensor) -> torch.Tensor:
         """Return unit-norm vectors float32 (B, 2048) of RGB images (B, 3, H, W) in [0, 1]."""
@@ -225,8 +224,8 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
         )
     net = ApGemNet(
         depth,
-        mean=_three(tensors, "preprocess.mean", IMAGENET_MEAN, where),
-        deviation=_three(tensors, "preprocess.std", IMAGENET_DEVIATION, where),
+        mean=tensors.get("preprocess.mean", IMAGENET_MEAN),
+        deviation=tensors.get("preprocess.std", IMAGENET_DEVIATION),
         normalised_features=bool(tensors.get("model_options.norm_features", False)),
     )
     return load_strictly(net, state, where, may_lack=batch_counters(net)).eval()
@@ -241,26 +240,5 @@ def whitening_from(
             f"{where} has no whitening {name!r}; it has {', '.join(known) or 'none'} "
             "(an empty name means no whitening)"
         )
-    parts = {part: tensors.get(f"pca.{name}.{part}") for part in PCA_PARTS}
-    mean, components, variance, whiten = parts.values()
-    if mean is None or components is None or variance is None or whiten is None:
-        lost = ", ".join(part for part, value in parts.items() if value is None)
-        raise DataError(f"the whitening {name} lacks {lost}", path=where)
-    count = len(components)
-    sizes = tuple(mean.shape), tuple(components.shape), tuple(variance.shape)
-    if sizes != ((DESCRIPTOR_SIZE,), (count, DESCRIPTOR_SIZE), (count,)):
-        raise DataError(
-            f"the whitening {name} has mean, components and variances of shapes {sizes}", path=where
-        )
-    if whiten and not bool((variance > 0).all()):
-        raise DataError(f"some variances of the whitening {name} are not positive", path=where)
+    mean, components, variance, whiten = (tensors[f"pca.{name}.{part}"] for part in PCA_PARTS)
     return Whitening(mean, components, variance, power=power if whiten else 0.0)
-
-
-def _three(
-    tensors: Mapping[str, torch.Tensor], key: str, default: Iterable[float], where: str
-) -> list[float]:
-    values = tensors[key].double().flatten().tolist() if key in tensors else list(default)
-    if len(values) != 3:
-        raise DataError(f"{key} has {len(values)} values, not three for R, G and B", path=where)
-    return values
