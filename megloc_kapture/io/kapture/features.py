@@ -13,6 +13,7 @@ import re
 import tarfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -233,14 +234,11 @@ class FeatureReader:
                 f"has {self.config.dsize} x {self.config.dtype.name}",
                 path=path,
             )
-        self._names: list[str] | None = None
 
-    @property
+    @cached_property
     def names(self) -> list[str]:
-        if self._names is None:
-            cut = len(SUFFIX[self.kind])
-            self._names = sorted({n[:-cut] for s in self._sources for n in s.names()})
-        return list(self._names)
+        cut = len(SUFFIX[self.kind])
+        return sorted({n[:-cut] for s in self._sources for n in s.names()})
 
     def __contains__(self, image: str) -> bool:
         name = image + SUFFIX[self.kind]

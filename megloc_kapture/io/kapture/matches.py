@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -37,20 +38,17 @@ class MatchesReader:
     def __init__(self, type_name: str, folders: Sequence[Path]) -> None:
         self.type_name = type_name
         self._sources = [s for folder in folders for s in blob_sources(folder, "matches")]
-        self._pairs: list[tuple[str, str]] | None = None
 
-    @property
+    @cached_property
     def pairs(self) -> list[tuple[str, str]]:
-        if self._pairs is None:
-            pairs = set()
-            for source in self._sources:
-                for name in source.names():
-                    parts = name.removesuffix(SUFFIX["matches"]).split(_BETWEEN)
-                    if len(parts) != 2 or parts[0] == parts[1]:
-                        raise DataError("does not name a pair of images", path=source.where(name))
-                    pairs.add((min(parts), max(parts)))
-            self._pairs = sorted(pairs)
-        return list(self._pairs)
+        pairs = set()
+        for source in self._sources:
+            for name in source.names():
+                parts = name.removesuffix(SUFFIX["matches"]).split(_BETWEEN)
+                if len(parts) != 2 or parts[0] == parts[1]:
+                    raise DataError("does not name a pair of images", path=source.where(name))
+                pairs.add((min(parts), max(parts)))
+        return sorted(pairs)
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
         return self._find(*pair) is not None
