@@ -8,6 +8,7 @@ come from a second checkpoint: MegLoc fine-tunes them with a frozen detector.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -270,16 +271,13 @@ def _conv3(channels_in: int, channels_out: int) -> nn.Conv2d:
     return nn.Conv2d(channels_in, channels_out, kernel_size=3, padding=1)
 
 
-class _Block(nn.Module):
-    def __init__(self, channels_in: int, channels_out: int, size: int, *, relu: bool = True):
-        super().__init__()
-        self.conv = nn.Conv2d(channels_in, channels_out, size, padding=size // 2)
-        self.bn = nn.BatchNorm2d(channels_out, eps=_EPSILON)
-        self.relu = relu
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = self.conv(x)
-        return self.bn(functional.relu_(x) if self.relu else x)
+def _block(channels_in: int, channels_out: int, size: int, *, relu: bool = True) -> nn.Sequential:
+    layers: dict[str, nn.Module] = {
+        "conv": nn.Conv2d(channels_in, channels_out, size, padding=size // 2),
+        "relu": nn.ReLU(inplace=True) if relu else nn.Identity(),
+        "bn": nn.BatchNorm2d(channels_out, eps=_EPSILON),
+    }
+    return nn.Sequential(OrderedDict(layers))
 
 
 class SuperPointBatchNormNet(nn.Module):
@@ -291,16 +289,16 @@ class SuperPointBatchNormNet(nn.Module):
         super().__init__()
         pool = nn.MaxPool2d(2)
         self.backbone = nn.Sequential(
-            nn.Sequential(_Block(1, 64, 3), _Block(64, 64, 3), pool),
-            nn.Sequential(_Block(64, 64, 3), _Block(64, 64, 3), pool),
-            nn.Sequential(_Block(64, 128, 3), _Block(128, 128, 3), pool),
-            nn.Sequential(_Block(128, 128, 3), _Block(128, 128, 3)),
+            nn.Sequential(_block(1, 64, 3), _block(64, 64, 3), pool),
+            nn.Sequential(_block(64, 64, 3), _block(64, 64, 3), pool),
+            nn.Sequential(_block(64, 128, 3), _block(128, 128, 3), pool),
+            nn.Sequential(_block(128, 128, 3), _block(128, 128, 3)),
         )
         self.detector = nn.Sequential(
-            _Block(128, 256, 3), _Block(256, CELL_PX**2 + 1, 1, relu=False)
+            _block(128, 256, 3), _block(256, CELL_PX**2 + 1, 1, relu=False)
         )
         self.descriptor = nn.Sequential(
-            _Block(128, 256, 3), _Block(256, DESCRIPTOR_SIZE, 1, relu=False)
+            _block(128, 256, 3), _block(256, DESCRIPTOR_SIZE, 1, relu=False)
         )
 
     def forward(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
