@@ -27,7 +27,7 @@ from megloc_kapture.io.images import decode_image_rgb, photo_of, turned_upright
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query as ImageQuery
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
 
 _PAGE = Path(__file__).with_name("localize.html")
 _PAGE_POLICY = (
@@ -70,19 +70,15 @@ class CameraModel(BaseModel):
     )
 
 
-class Transform(BaseModel):
-    """Rigid transform x_cam = R x_world + t; COLMAP's axes: x right, y down, z forward."""
-
-    quat_wxyz: Annotated[list[float], Field(min_length=4, max_length=4)]
-    translation: Vector = Field(description="in the unit of the map")
-
-
 class Answer(BaseModel):
     """Result for an image: a pose, or the reason for its absence."""
 
     localized: bool
     reason: str | None = Field(description="reason why there is no pose")
-    cam_from_world: Transform | None
+    cam_from_world: RigidTransform | None = Field(
+        description="x_cam = R x_world + t, t in the unit of the map; COLMAP's axes: x right, y "
+        "down, z forward"
+    )
     camera_center: Vector | None = Field(description="camera centre in the map's frame")
     covariance: list[list[float]] | None = Field(
         description="6 by 6: rotation in radians, then translation in the unit of the map, of a "
@@ -108,14 +104,10 @@ class Answer(BaseModel):
         pose = result if isinstance(result, Pose) else None
         used = camera if pose is None else pose.camera or camera
         covariance = None if pose is None else pose.covariance
-        transform = None
-        if pose is not None:
-            quat, translation = pose.cam_from_world.quat_wxyz, pose.cam_from_world.translation
-            transform = Transform(quat_wxyz=list(quat), translation=list(translation))
         return cls(
             localized=pose is not None,
             reason=result.reason if isinstance(result, Failure) else None,
-            cam_from_world=transform,
+            cam_from_world=None if pose is None else pose.cam_from_world,
             camera_center=None if pose is None else pose.cam_from_world.center().tolist(),
             covariance=None if covariance is None else covariance.tolist(),
             confidence=result.confidence,
