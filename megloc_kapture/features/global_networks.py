@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
 from torch import nn
+from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import Images
@@ -208,7 +209,7 @@ class ApGem(GlobalNetwork[ApGemOptions]):
             vectors: torch.Tensor = net.describe(batch)
         with inference(batch.device):
             for whiten in whitening:
-                vectors = whiten(vectors)
+                vectors = functional.normalize(whiten(vectors))
         return vectors
 
 

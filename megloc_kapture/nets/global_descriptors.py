@@ -189,29 +189,6 @@ class ApGemNet(ResNet):
             return functional.normalize(self.fc(pooled))
 
 
-class Whitening(nn.Module):
-    """PCA whitening by a power of the variance, then normalisation.
-
-    ``power`` is 0.5 in scikit-learn and 0.25 in the authors' evaluation; 0 means PCA without
-    whitening. The PCA has ``mean`` (D,), ``components`` (K, D) and ``variance`` (K,).
-    """
-
-    mean: torch.Tensor
-    weight: torch.Tensor
-
-    def __init__(
-        self, mean: torch.Tensor, components: torch.Tensor, variance: torch.Tensor, *, power: float
-    ) -> None:
-        super().__init__()
-        scale = variance.double().pow(-power)
-        self.register_buffer("mean", mean.float())
-        self.register_buffer("weight", (scale[:, None] * components.double()).float())
-
-    def forward(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Whiten vectors (B, D) to unit-norm float32 (B, K)."""
-        return functional.normalize(functional.linear(vectors.float() - self.mean, self.weight))
-
-
 def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
     """Build the network from the tensors of ``scripts/convert_weights.py``, for inference."""
     beside = ("preprocess.", "model_options.", "pca.")
@@ -233,7 +210,12 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
 
 def whitening_from(
     tensors: Mapping[str, torch.Tensor], name: str, where: str, *, power: float
-) -> Whitening:
+) -> nn.Linear:
+    """Build a PCA whitening, for vectors that are normalised afterwards.
+
+    Components are divided by the variances to a ``power``: 0.5 in scikit-learn, 0.25 in the
+    authors' evaluation.
+    """
     known = sorted({key.split(".")[1] for key in tensors if key.startswith("pca.")})
     if name not in known:
         raise OptionError(
@@ -241,4 +223,9 @@ def whitening_from(
             "(an empty name means no whitening)"
         )
     mean, components, variance, whiten = (tensors[f"pca.{name}.{part}"] for part in PCA_PARTS)
-    return Whitening(mean, components, variance, power=power if whiten else 0.0)
+    weight = components.double()
+    if whiten:
+        weight = variance.double().pow(-power)[:, None] * weight
+    layer = nn.Linear(weight.shape[1], weight.shape[0])
+    layer.weight.data, layer.bias.data = weight.float(), -(weight @ mean.double()).float()
+    return layer
