@@ -93,14 +93,9 @@ def absolute_pose(
     points_world: Floats,
     camera: Camera,
     options: AbsolutePoseOptions | None = None,
-    point_covariances: Floats | None = None,
 ) -> Pose | Failure:
-    """Estimate ``cam_from_world`` of one camera from pixels (N, 2) and world points (N, 3).
-
-    Covariances (N, 6) are as in :class:`View`.
-    """
-    view = View(camera, RigidTransform.identity(), points_px, points_world, point_covariances)
-    return rig_pose([view], options)
+    """Estimate ``cam_from_world`` of one camera from pixels (N, 2) and world points (N, 3)."""
+    return rig_pose([View(camera, RigidTransform.identity(), points_px, points_world)], options)
 
 
 def rig_pose(views: Sequence[View], options: AbsolutePoseOptions | None = None) -> Pose | Failure:

@@ -31,6 +31,7 @@ from megloc_kapture.refinement.pyramid import (
 from megloc_kapture.values import RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
+_MAX_ANGLE_DEG = 60.0  # between the viewing directions of a query and of its references
 # held-out images: largest and smallest number of displacements (five are all above the true median
 # with a chance of 1 in 32), and largest number of images tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
@@ -62,7 +63,6 @@ class ReferenceImages:
         *,
         max_references: int,
         only_first: bool = False,
-        max_angle_deg: float = 60.0,
         min_distance_m: float = 0.0,
     ) -> list[str]:
         """Return images with a similar viewing direction, preferably half of them from ``first``.
@@ -71,7 +71,7 @@ class ReferenceImages:
         all others.
         """
         forward = cam_from_world.rotation_matrix()[2]
-        facing = self._directions @ forward >= np.cos(np.deg2rad(max_angle_deg))
+        facing = self._directions @ forward >= np.cos(np.deg2rad(_MAX_ANGLE_DEG))
         distances = np.linalg.norm(self._centers - cam_from_world.center(), axis=1)
         usable = facing & (distances >= min_distance_m)
         order = [int(row) for row in np.argsort(distances, kind="stable") if usable[row]]

@@ -20,8 +20,8 @@ from megloc_kapture.localization import absolute_pose as module
 from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
-    absolute_pose,
     refine_pose,
+    rig_pose,
 )
 from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
@@ -163,12 +163,8 @@ def test_points_count_by_the_noise_of_the_map(monkeypatch: pytest.MonkeyPatch) -
     quarter = replace(view, point_covariances=covariances / 4)
     assert pose(known, 0.5) == pose(quarter, 1.0) != pose(known, 1.0)
     assert pose(known, 0.0) == pose(view, 1.0)
-    # absolute_pose passes covariances on
-    given = view.points_px, view.points_world, PINHOLE
-    plain, weighted = (
-        located(absolute_pose(*given, point_covariances=weighted_view)).cam_from_world
-        for weighted_view in (None, covariances)
-    )
+    # rig_pose passes covariances on
+    plain, weighted = (located(rig_pose([each])).cam_from_world for each in (view, known))
     assert plain != weighted
 
 
