@@ -166,7 +166,7 @@ def check_submission(
         reference = Reference(protocol=PROTOCOLS.get(dataset, Protocol()))
     if reference.protocol.pose_file == "mlad":
         poses, findings = _check_mlad(path, reference)
-        expected = len(reference.pairs)
+        expected = len(reference.relocalization)
     else:
         poses, findings = _check_file(path, dataset, reference)
         expected = len(reference.expected)
@@ -199,7 +199,7 @@ def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, li
 
 def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
     wanted: dict[str, dict[str, str]] = defaultdict(dict)  # file -> timestamps -> reference
-    for pair in reference.pairs:
+    for pair in reference.relocalization:
         stamps = f"{PurePosixPath(pair.reference).stem} {PurePosixPath(pair.query).stem}"
         wanted[pair.file][stamps] = pair.reference
     findings, num_poses = list[Finding](), 0

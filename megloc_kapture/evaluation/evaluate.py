@@ -142,7 +142,7 @@ def evaluate_results(
         require(true_poses, "has no poses, as true poses should", path=truth)
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
-    relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)
+    relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.relocalization)
     if align == "none":
         _warn_of_unit(contexts)
     elif relative:
@@ -150,8 +150,8 @@ def evaluate_results(
     references = first_map_poses(contexts) if relative else {}
     require(
         not relative or references,
-        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their reference "
-        "images: give the map with --map",
+        f"the {len(benchmark.relocalization)} pairs to relocalize need the poses of their "
+        "reference images: give the map with --map",
     )
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
@@ -188,7 +188,7 @@ def results_without_truth(
     contexts = [_context(source, mapping) for source in results]
     if len(contexts) > 1:
         _warn_of_unit(contexts)
-    map_poses = first_map_poses(contexts) if benchmark.pairs else {}
+    map_poses = first_map_poses(contexts) if benchmark.relocalization else {}
     known = {image for context in contexts for image in context.query_images()}
     read = _read(results, benchmark, contexts, labels, known, map_poses)
     for first, other in pairwise(result for result in read if result.images):
@@ -197,7 +197,7 @@ def results_without_truth(
             f"no query in common: {first.label} has {first.images[0]!r}, {other.label} has "
             f"{other.images[0]!r}",
         )
-    queries = set(benchmark.names) or {pair.query for pair in benchmark.pairs}
+    queries = set(benchmark.names) or {pair.query for pair in benchmark.relocalization}
     if not queries:
         of_results = {image for result in read for image in result.images}
         queries = benchmark.scored(known | of_results)

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold, thresholds_from_pairs
-from megloc_kapture.io.dataset_tables import (
-    ImageGroup,
-    Protocol,
-    RelocalizationPair,
-    World,
-    read_groups,
-    read_names,
-    read_protocol,
-    read_relocalization,
-    read_world,
-)
+from megloc_kapture.io.dataset_tables import ImageGroup, Protocol, SideTables, read_side_tables
 
 TWIN_PREFIX = "synthetic-"
 
@@ -86,20 +76,9 @@ def protocol_of(name: str) -> Protocol:
 _DEFAULT_GROUP = ImageGroup()
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """The rules of a benchmark.
-
-    ``world`` transforms between the local frame, that of the map and the true poses, and the
-    official frame of pose files. ``names`` is the challenge's list, image -> name in a pose file;
-    ``pairs`` are the image pairs of an MLAD challenge.
-    """
-
-    protocol: Protocol = Protocol()
-    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
-    world: World = World()
-    names: Mapping[str, str] = field(default_factory=dict)
-    pairs: tuple[RelocalizationPair, ...] = ()
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Benchmark(SideTables):
+    """The rules of a benchmark."""
 
     def thresholds(self) -> tuple[Threshold, ...]:
         return thresholds_from_pairs(self.protocol.thresholds)
@@ -125,12 +104,5 @@ def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = No
     A dataset overrides the protocol of the workspace, but not its groups, frame, names and pairs.
     """
     named = None if dataset is None else protocol_of(dataset)
-    if side_tables is None:
-        return Benchmark(protocol=named or Protocol())
-    return Benchmark(
-        protocol=named or read_protocol(side_tables),
-        groups=read_groups(side_tables),
-        world=read_world(side_tables),
-        names=read_names(side_tables),
-        pairs=tuple(read_relocalization(side_tables)),
-    )
+    tables = SideTables() if side_tables is None else read_side_tables(Path(side_tables))
+    return Benchmark(**vars(tables) | {"protocol": named or tables.protocol})

@@ -181,8 +181,8 @@ def read_result(
     """
     path = Path(source)
     is_mlad = benchmark.protocol.pose_file == "mlad"
-    if is_mlad and benchmark.pairs and not (path / "sensors").is_dir():
-        by_pair = _read_mlad(path, benchmark.pairs, references or {}, benchmark.world)
+    if is_mlad and benchmark.relocalization and not (path / "sensors").is_dir():
+        by_pair = _read_mlad(path, benchmark.relocalization, references or {}, benchmark.world)
         poses = {pair.query: pose for pair, pose in by_pair.items()}
         return Result(label, poses, tuple(sorted(poses)), by_pair=by_pair)
     if path.is_dir() and model_of(path) is None:

@@ -336,7 +336,7 @@ def evaluate_pairs(
     FILE". Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the
     relative translation; ``by_center`` has those of the camera centre.
     """
-    pairs, estimated = benchmark.pairs, result.poses_of_pairs(benchmark.pairs)
+    pairs, estimated = benchmark.relocalization, result.poses_of_pairs(benchmark.relocalization)
     absent = next((pair for pair in pairs if pair.reference not in references), None)
     if absent is not None:
         raise DataError(f"reference {absent.reference!r} of {absent.file!r} has no pose in the map")

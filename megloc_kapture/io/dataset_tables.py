@@ -190,14 +190,19 @@ def _unreadable(image: ImageName, reason: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideTables:
-    """The tables that describe a dataset; an empty table has no file."""
+    """The tables that describe a dataset; an empty table has no file.
 
-    protocol: Protocol
+    ``world`` transforms between the local frame, that of the map and the true poses, and the
+    official frame of pose files. ``names`` is the challenge's list, image -> name in a pose file;
+    ``relocalization`` has the image pairs of an MLAD challenge.
+    """
+
+    protocol: Protocol = Protocol()
     groups: Mapping[str, ImageGroup] = field(default_factory=dict)
     priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
     names: Mapping[str, str] = field(default_factory=dict)
     relocalization: Sequence[RelocalizationPair] = ()
-    world: World | None = None
+    world: World = World()
 
 
 def read_side_tables(folder: Path) -> SideTables:
@@ -207,13 +212,13 @@ def read_side_tables(folder: Path) -> SideTables:
         priors=read_priors(folder),
         names=read_names(folder),
         relocalization=read_relocalization(folder),
-        world=read_world(folder) if (folder / WORLD_FILE).is_file() else None,
+        world=read_world(folder),
     )
 
 
 def write_side_tables(folder: Path, tables: SideTables) -> None:
     write_protocol(folder, tables.protocol)
-    if tables.world is not None:
+    if tables.world != World():
         write_world(folder, tables.world)
     if tables.groups:
         write_groups(folder, tables.groups)

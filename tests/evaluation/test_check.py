@@ -219,7 +219,7 @@ def drive() -> tuple[Reference, dict[str, RigidTransform]]:
     protocol = Protocol(dataset="4seasons", pose_file="mlad")
     map_poses = dict(zip(references, first, strict=True))
     return Reference(
-        folder="import", protocol=protocol, pairs=tuple(pairs), map_poses=map_poses
+        folder="import", protocol=protocol, relocalization=pairs, map_poses=map_poses
     ), poses
 
 
@@ -253,8 +253,8 @@ def test_mlad_files(check: Check) -> None:
 
 def test_a_folder_of_mlad_files(tmp_path: Path) -> None:
     reference, poses = drive()
-    second = [replace(pair, file="second.txt") for pair in reference.pairs[50:]]
-    both = replace(reference, pairs=(*reference.pairs[:50], *second))
+    second = [replace(pair, file="second.txt") for pair in reference.relocalization[50:]]
+    both = replace(reference, relocalization=(*reference.relocalization[:50], *second))
     folder = tmp_path / "submission"
     folder.mkdir()
 

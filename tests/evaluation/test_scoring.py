@@ -124,7 +124,7 @@ def evaluate_all(
 ) -> Any:
     result = Result("", estimated, tuple(estimated))
     return evaluate_pairs(
-        result, truth, Benchmark(pairs=tuple(pairs)), references, thresholds=THRESHOLDS
+        result, truth, Benchmark(relocalization=tuple(pairs)), references, thresholds=THRESHOLDS
     )
 
 
@@ -160,7 +160,7 @@ def test_mlad_pairs_and_conditions() -> None:
     actual = evaluate_pairs(
         Result("", estimated, tuple(estimated), statuses),
         truth,
-        Benchmark(pairs=tuple(pairs)),
+        Benchmark(relocalization=tuple(pairs)),
         references,
         thresholds=THRESHOLDS,
     )
