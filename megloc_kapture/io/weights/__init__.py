@@ -110,22 +110,6 @@ def lookup(name: str) -> Weights:
     return registry()[name]
 
 
-def by_sha256(sha256: str) -> tuple[Weights, PublishedFile] | None:
-    return next((entry for entry in _all_files() if entry[1].sha256 == sha256), None)
-
-
-def by_file_name(name: str) -> tuple[Weights, PublishedFile] | None:
-    """Find the network and the published file by a file name."""
-    for weights, file in _all_files():
-        if name in [path.rpartition("/")[2] for path in file.names]:
-            return weights, file
-    return None
-
-
-def _all_files() -> list[tuple[Weights, PublishedFile]]:
-    return [(weights, file) for weights in registry().values() for file in weights.files]
-
-
 class MissingWeightsError(DataError):
     """Missing checkpoints; the message has a line for each, with source and command to add it."""
 
@@ -406,23 +390,31 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
 
 
 def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, str]:
+    """Return the network of a file, and the name under which the file is kept."""
+    among = list(registry().values()) if name is None else [lookup(name)]
+    is_converted = source.suffix == ".safetensors"
+    if name is not None and is_converted:
+        return among[0], among[0].converted
+    files = [(weights, file) for weights in among for file in weights.files]
+    same = [(weights, file) for weights, file in files if file.sha256 == sha256]
+    named = [
+        (weights, file)
+        for weights, file in files
+        if source.name in [Path(path).name for path in file.names]
+    ]
+    alike = [
+        (weights, file)
+        for weights, file in files
+        if name is not None and Path(file.name).suffix == source.suffix
+    ]
+    for weights, file in (*same, *named, *alike):
+        return weights, file.name
+    if is_converted and source.stem in registry():
+        return registry()[source.stem], source.name
     if name is None:
-        entry = by_sha256(sha256) or by_file_name(source.name)
-        if entry is not None:
-            return entry[0], entry[1].name
-        if source.suffix == ".safetensors" and source.stem in registry():
-            return registry()[source.stem], source.name
         raise OptionError(
             f"{source}: neither its sha256 nor its name is in the registry; say what it is with "
             "--name (megloc weights list)"
         )
-    weights = lookup(name)
-    if source.suffix == ".safetensors":
-        return weights, weights.converted
-    same = [file for file in weights.files if file.sha256 == sha256]
-    named = [file for file in weights.files if source.name in file.names]
-    alike = [file for file in weights.files if Path(file.name).suffix == source.suffix]
-    for file in (*same, *named, *alike):
-        return weights, file.name
-    names = ", ".join(file.name for file in weights.files)
-    raise OptionError(f"{source}: {name} is kept as {names} or {weights.converted}")
+    kept_as = ", ".join(file.name for _, file in files)
+    raise OptionError(f"{source}: {name} is kept as {kept_as} or {among[0].converted}")
