@@ -61,10 +61,6 @@ class Aliked(LocalNetwork[AlikedOptions]):
         # each model has its own feature type, since descriptors of different models do not match
         self.name = Path(self._weights.name).stem
 
-    @property
-    def descriptor_size(self) -> int:
-        return int(self.network(aliked_from)[0].descriptor_size)
-
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         net, device = self.network(aliked_from)
         with inference(device, self.options.half_precision):

@@ -75,7 +75,6 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
     """ASLFeat keypoints (x, y, score) with unit-norm descriptors, float32 (N, 128)."""
 
     name = "aslfeat"
-    descriptor_size = DESCRIPTOR_SIZE
     Options = AslFeatOptions
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:

@@ -59,7 +59,6 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
     method: ClassVar[str]
     _load: Any
     _load_with: tuple[Any, ...] = ()
-    _channels_last: ClassVar[bool] = False
 
     def __init__(self, options: GlobalOptions | None = None) -> None:
         super().__init__(options)
@@ -71,8 +70,7 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
         return self.describe_many([image])[0]
 
     def describe_many(self, images: Images) -> NDArray[np.float32]:
-        made = self.network(self._load, *self._load_with, channels_last=self._channels_last)
-        network, device = made
+        network, device = self.network(self._load, *self._load_with)
         batch = torch.cat([self._seen(image, device) for image in images])
         return self._vectors(network, batch).cpu().numpy()
 

@@ -66,7 +66,6 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
     """
 
     name = "xfeat"
-    descriptor_size = 64
     Options = XFeatOptions
 
     def __init__(self, options: XFeatOptions | None = None) -> None:
@@ -115,7 +114,6 @@ class Disk(_KorniaFeatures[DiskOptions]):
     """The extractor ``disk``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 128)."""
 
     name = "disk"
-    descriptor_size = 128
     Options = DiskOptions
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:

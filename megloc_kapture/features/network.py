@@ -30,9 +30,6 @@ LocalOptions = TypeVar("LocalOptions", bound=LocalNetworkOptions)
 
 
 class LocalNetwork(Checkpointed[LocalOptions], ABC):
-    descriptor_dtype = "float32"
-    metric = "L2"
-
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:

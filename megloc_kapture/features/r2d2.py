@@ -68,7 +68,6 @@ class R2D2(LocalNetwork[R2D2Options]):
     """
 
     name = "r2d2"
-    descriptor_size = DESCRIPTOR_SIZE
     Options = R2D2Options
 
     def __init__(self, options: R2D2Options | None = None) -> None:

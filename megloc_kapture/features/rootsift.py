@@ -34,9 +34,6 @@ class RootSift:
     """SIFT keypoints with Hellinger-normalised descriptors, float32 (N, 128), unit length."""
 
     name = "rootsift"
-    descriptor_size = 128
-    descriptor_dtype = "float32"
-    metric = "L2"
     Options = RootSiftOptions
 
     def __init__(self, options: RootSiftOptions | None = None) -> None:
@@ -64,7 +61,7 @@ class RootSift:
         )
         keypoints, descriptors = sift.detectAndCompute(gray, None)
         if descriptors is None:
-            descriptors = np.zeros((0, self.descriptor_size), np.float32)
+            descriptors = np.zeros((0, 128), np.float32)
         rows = [
             (*keypoint.pt, keypoint.response, keypoint.size, keypoint.angle)
             for keypoint in keypoints
@@ -115,9 +112,6 @@ class ColmapSift:
     """The extractor ``sift``; descriptors uint8 (N, 128) have a norm of about 512."""
 
     name = "sift"
-    descriptor_size = 128
-    descriptor_dtype = "uint8"
-    metric = "L2"
     Options = ColmapSiftOptions
 
     def __init__(self, options: ColmapSiftOptions | None = None) -> None:

@@ -72,7 +72,6 @@ class SuperPoint(LocalNetwork[SuperPointOptions]):
     """
 
     name = "superpoint"
-    descriptor_size = DESCRIPTOR_SIZE
     Options = SuperPointOptions
 
     def __init__(self, options: SuperPointOptions | None = None) -> None:

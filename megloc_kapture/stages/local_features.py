@@ -92,10 +92,9 @@ def _writers(
     output: Path, extractor: LocalFeatureExtractor, features: LocalFeatures
 ) -> tuple[FeatureWriter, FeatureWriter]:
     name, px, descriptors = extractor.name, features.keypoints_px, features.descriptors
-    metric = getattr(extractor, "metric", "L2")
     configs = (
         FeatureConfig(name, np.dtype(px.dtype), px.shape[1]),
-        FeatureConfig(name, np.dtype(descriptors.dtype), descriptors.shape[1], name, metric),
+        FeatureConfig(name, np.dtype(descriptors.dtype), descriptors.shape[1], name),
     )
     return (
         FeatureWriter(output, "keypoints", name, configs[0], orphan=True),

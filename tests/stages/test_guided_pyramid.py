@@ -47,7 +47,6 @@ class Upright:
     """Corners of one size whose descriptors are not invariant to rotation."""
 
     name = "upright"
-    metric = "L2"
 
     def __init__(self, most: int = 1000) -> None:
         self.calls, self.most = 0, most
