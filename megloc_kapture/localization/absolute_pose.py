@@ -336,7 +336,7 @@ def refine_pose(
         inliers=inliers,
         covariance=covariance,
     )
-    return check_stable(refined, covariance, _median(projected.depths[rows]), options)
+    return check_stable(refined, covariance, _median(projected.depths[rows]))
 
 
 def _minimised(
@@ -379,9 +379,7 @@ def _minimised(
     return best
 
 
-def check_stable(
-    pose: Pose, covariance: Floats, depth: float, options: AbsolutePoseOptions
-) -> Pose | Failure:
+def check_stable(pose: Pose, covariance: Floats, depth: float) -> Pose | Failure:
     """Return the pose, or a Failure if its centre is too uncertain.
 
     The limit is relative to the inliers' median ``depth``.

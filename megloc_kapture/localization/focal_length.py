@@ -313,7 +313,7 @@ def refine_with_intrinsics(
             covariance = pose.covariance + fit.pose_covariance
             camera = replace(problem.views[0].camera, focal_deviation=fit.deviation)
             pose = replace(pose, covariance=covariance, camera=camera)
-            return problem, check_stable(pose, covariance, fit.depth, options)
+            return problem, check_stable(pose, covariance, fit.depth)
         updates += 1
         problem = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
         estimate = replace(estimate, rig_from_world=fit.rig_from_world)

@@ -337,9 +337,9 @@ class FeatureWriter:
         *,
         orphan: bool = False,
     ) -> None:
-        self.kind, self.type_name, self.config = kind, type_name, config
+        self.kind, self.config = kind, config
         self._folder = feature_folder(Path(root), kind, type_name, orphan=orphan)
-        self._path = path = self._folder / f"{kind}.txt"
+        path = self._folder / f"{kind}.txt"
         content = format_config(kind, config)
         if not path.exists():
             write_bytes(path, content)
@@ -349,9 +349,7 @@ class FeatureWriter:
     def __contains__(self, image: str) -> bool:
         return safe_join(self._folder, image + SUFFIX[self.kind]).is_file()
 
-    def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
-        """Write an image's array, (N, dsize) or (dsize,); return the configuration and its file."""
+    def write(self, image: str, array: ArrayLike) -> None:
+        """Write an image's array, (N, dsize) or (dsize,)."""
         content = np.ascontiguousarray(array, dtype=self.config.dtype).tobytes()
-        path = safe_join(self._folder, check_field(image) + SUFFIX[self.kind])
-        write_bytes(path, content)
-        return self._path, path
+        write_bytes(safe_join(self._folder, check_field(image) + SUFFIX[self.kind]), content)

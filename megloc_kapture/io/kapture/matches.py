@@ -96,7 +96,6 @@ class MatchesWriter:
     """Writer for the matches of one keypoints type; each file is written atomically."""
 
     def __init__(self, root: Path, type_name: str, *, orphan: bool = False) -> None:
-        self.type_name = type_name
         self._folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
         with writing(self._folder):
             # kapture finds a type by its folder, so it exists even if no pair is written
@@ -105,16 +104,14 @@ class MatchesWriter:
     def __contains__(self, pair: tuple[str, str]) -> bool:
         return safe_join(self._folder, _name(min(pair), max(pair))).is_file()
 
-    def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
-        """Write indices (M, 2) in the order ``a``, ``b`` and scores (M,); return the file."""
+    def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> None:
+        """Write indices (M, 2) in the order ``a``, ``b`` and scores (M,)."""
         pairs = np.asarray(indices).reshape(-1, 2)
         rows = np.empty((len(pairs), 3), dtype="<f8")
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
         rows[:, 2] = scores
         name = _name(check_field(min(a, b)), check_field(max(a, b)))
-        path = safe_join(self._folder, name)
-        write_bytes(path, rows.tobytes())
-        return path
+        write_bytes(safe_join(self._folder, name), rows.tobytes())
 
 
 def _name(first: str, second: str) -> str:
