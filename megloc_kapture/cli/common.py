@@ -211,7 +211,15 @@ class Working(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class Linked:
+    """Flag of commands that read kapture folders."""
+
+    allow_links_below: Folders = ()
+    """No effect; accepted for older scripts. Links in kapture folders are always followed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading(Linked):
     """Flags of commands that read features of kapture folders."""
 
     features_dir: Folders = ()

@@ -12,6 +12,7 @@ from megloc_kapture.cli.common import (
     Common,
     Console,
     Force,
+    Linked,
     Output,
     Overwrite,
     Texts,
@@ -186,7 +187,7 @@ class Export(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Common):
+class View(Linked, Common):
     """Write a page that shows a map and localized queries in 3D; it works offline."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]

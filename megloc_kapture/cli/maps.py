@@ -12,6 +12,7 @@ from megloc_kapture.cli.common import (
     Console,
     Force,
     Input,
+    Linked,
     Output,
     Reading,
     Texts,
@@ -163,7 +164,7 @@ class Densify(Reading, Choosing, Working):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinePoses(Choosing, Working):
+class RefinePoses(Linked, Choosing, Working):
     """Refine the poses of localized queries; a refined pose that is no better is rejected, with
     the reason."""
 

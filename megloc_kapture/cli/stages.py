@@ -22,6 +22,7 @@ from megloc_kapture.cli.common import (
     Force,
     Input,
     Inputs,
+    Linked,
     Output,
     Overwrite,
     Reading,
@@ -80,7 +81,7 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractLocal(Choosing, Working):
+class ExtractLocal(Linked, Choosing, Working):
     """Extract local features of all images of kapture folders."""
 
     input: Inputs = ()
@@ -400,7 +401,7 @@ def stage_command(name: str) -> type[Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preprocess(Computing, Working):
+class Preprocess(Linked, Computing, Working):
     """Resize, undistort and mask the images of a kapture folder; cameras are adapted."""
 
     input: Input

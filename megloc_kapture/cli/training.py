@@ -15,6 +15,7 @@ from megloc_kapture.cli.common import (
     Folders,
     Input,
     Inputs,
+    Linked,
     Output,
     Overwrite,
     Texts,
@@ -32,7 +33,7 @@ from megloc_kapture.values import RigidTransform
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Common):
+class Train(Linked, Common):
     """Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on
     photographs. Repeat the command to resume."""
 
@@ -88,7 +89,7 @@ _MIN_SHOWN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainField(Common):
+class TrainField(Linked, Common):
     """Train a neural field (NeRF-W) on the images of a map, to render views and refine poses.
     Repeat the command to resume."""
 
@@ -158,7 +159,7 @@ class TrainField(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Working):
+class Render(Linked, Working):
     """Render views of a neural field: at a pose, along a result, or between map cameras."""
 
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
