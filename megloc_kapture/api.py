@@ -231,7 +231,7 @@ def open_map(
     preset: str = "classic",
     *,
     set: Changes | None = None,
-    features_dirs: Sequence[Path | str] = (),
+    features_dirs: Sequence[Path | str] | Path | str = (),
     pixel_origin: PixelOriginChoice = "auto",
 ) -> Map:
     """Open a map from this package or another tool, with all keypoint types that have points.
@@ -241,14 +241,12 @@ def open_map(
     path : kapture map, or a COLMAP model or workspace, which is imported into the user's cache if
         it is new or has changed (:func:`megloc_kapture.pipeline.map_making.kapture_of`).
     preset, set : localization options, ``set`` as ``{"localization.rank.name": "perceptual"}``.
-    features_dirs : additional folders with features.
+    features_dirs : additional folder or folders with features.
     pixel_origin : pixel origin of the map's intrinsics; auto detects it.
     """
     options = options_of_preset(preset, assignments=set or {})
     opened = KaptureMap.open(
-        kapture_of(path),
-        features_dirs=[Path(folder) for folder in features_dirs],
-        pixel_origin=pixel_origin,
+        kapture_of(path), features_dirs=features_dirs, pixel_origin=pixel_origin
     )
     if fault := opened.fault():
         raise DataError(f"{fault}; the poses would be wrong", path=Path(path))

@@ -205,6 +205,10 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
         megloc.map_photographs([np.zeros((8, 8, 3))])  # type: ignore[list-item]
     with pytest.raises(megloc.DataError, match="nowhere"):
         megloc.open_map(tmp_path / "nowhere").localize(scene / "query")
+    with pytest.raises(megloc.DataError, match="features: no such folder of features"):
+        megloc.open_map(built.kapture_map.folder.root, features_dirs="features")
+    with pytest.raises(megloc.OptionError, match=r"KaptureMap\.open"):
+        megloc.Localizer(str(built.kapture_map.folder.root))  # type: ignore[arg-type]
     with pytest.raises(megloc.OptionError, match="needs a reference model"):
         by = {"mapping_pairs.by": ["covisibility"]}
         megloc.build_map(scene / "mapping", set=by, workspace=tmp_path / "refused")

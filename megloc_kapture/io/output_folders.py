@@ -83,11 +83,12 @@ def staged_output(
     """Yield a staging folder whose content moves to ``folder`` when the block succeeds.
 
     Files that the last command of this kind wrote are removed, unless ``adds`` is set. All other
-    files in ``folder`` are kept. Raise OutputError if ``folder`` is one of the ``inputs``.
+    files in ``folder`` are kept. Raise OutputError if ``folder`` is or contains one of the
+    ``inputs``.
     """
     folder = Path(folder)
-    if folder.resolve() in {Path(path).resolve() for path in inputs if path is not None}:
-        raise OutputError(f"{folder}: is also an input, which would be lost; give another folder")
+    if any(Path(path).resolve().is_relative_to(folder.resolve()) for path in inputs if path):
+        raise OutputError(f"{folder}: is or contains an input, which may be lost; give another one")
     is_other = (folder / "sensors" / "sensors.txt").is_file() and _read_mark(folder)[:1] != [kind]
     if is_other and not adds:
         raise OutputError(f"{folder}: has other kapture data, which is kept; give an empty folder")

@@ -119,7 +119,7 @@ class KaptureMap:
         path: Path | str,
         *,
         keypoints_types: Sequence[str] = (),
-        features_dirs: Sequence[Path | str] = (),
+        features_dirs: Sequence[Path | str] | Path | str = (),
         pixel_origin: PixelOriginChoice = "auto",
     ) -> KaptureMap:
         """Open a kapture map.
@@ -134,7 +134,10 @@ class KaptureMap:
             pixel_origin in ("auto", "corner", "centre"),
             f"pixel_origin is {pixel_origin!r}; give auto, corner or centre",
         )
-        folder = KaptureFolder(path, features_dirs=features_dirs)
+        dirs = [features_dirs] if isinstance(features_dirs, Path | str) else features_dirs
+        folder = KaptureFolder(path, features_dirs=dirs)
+        for features_dir in folder.features_dirs:
+            require(features_dir.is_dir(), "no such folder of features", path=features_dir)
         data = folder.read()
         check_points(folder, "localize in")
         require(

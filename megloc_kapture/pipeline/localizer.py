@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
@@ -52,6 +52,9 @@ class Localizer:
         device: Device = "auto",
         precision: Precision = "full",
     ) -> None:
+        check_option(
+            isinstance(kapture_map, KaptureMap), "a Localizer needs a map: KaptureMap.open(folder)"
+        )
         self.map = kapture_map
         if options is not None and (device, precision) != ("auto", "full"):
             raise OptionError("give the device and the precision in the options")

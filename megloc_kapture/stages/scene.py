@@ -34,7 +34,7 @@ _SAMPLED_IMAGES = 32
 
 def check_points(folder: KaptureFolder, purpose: str) -> None:
     """Raise DataError if a folder has no map points for a purpose, such as ``localize in``."""
-    folder.read()  # another kind of folder gets a message of its own
+    folder.read()  # raises another message if this is no kapture folder
     require(
         folder.has_points(),
         f"no map to {purpose}: reconstruction/points3d.txt or observations.txt is missing; "

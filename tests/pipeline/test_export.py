@@ -162,7 +162,7 @@ def test_cameras_and_keypoints_are_scaled_to_smaller_images(map_copy: Path, tmp_
     np.testing.assert_allclose(xy, keypoints[:, :2] / 2, atol=1e-3)
     described = describe_sizes(scaled.folder)
     assert any("200x150, scaled from the 400x300" in text for text in described)
-    with pytest.raises(OutputError, match="is also an input"):
+    with pytest.raises(OutputError, match="is or contains an input"):
         export("colmap", map_copy, map=scaled, force=True)
     write_image(records / name, np.zeros((50, 50, 3), np.uint8))
     with pytest.raises(DataError, match=f"{name}: the image is 50x50, its camera says"):
