@@ -80,6 +80,7 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         ("sensors/sensors.txt", "x, n, camera, UNKNOWN_CAMERA, 640", "width and a height"),
         ("sensors/rigs.txt", f"deep, cam, {IDENTITY}", "also a sensor id"),
         ("sensors/rigs.txt", f"rig, cam, {IDENTITY}", "twice"),
+        ("sensors/rigs.txt", f"a, rig, {IDENTITY}\nrig, a, {IDENTITY}", "'rig' contains itself"),
         ("keypoints.txt", "n, float32", "expected 3 columns, got 2"),
         ("keypoints.txt", "n, float16, 2", "dtype 'float16' is not one of"),
         ("keypoints.txt", "n, float32, 0", "dsize '0'"),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Sequence
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, require
@@ -119,6 +120,11 @@ def read_rigs(path: Path, sensors: Collection[str]) -> dict[str, dict[str, Rigid
             pose = _pose(fields[2:])
             if pose is not None:
                 rig[sensor_id] = pose
+            if sensor_id in rigs:
+                try:
+                    TopologicalSorter(rigs).prepare()
+                except CycleError as error:
+                    raise DataError(f"rig {rig_id!r} contains itself") from error
     return {
         rig_id: {s: pose for s, pose in members.items() if s in sensors or s in rigs}
         for rig_id, members in rigs.items()
