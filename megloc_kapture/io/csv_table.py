@@ -84,6 +84,9 @@ def _cell(value: object) -> str:
     return ",".join(value) if isinstance(value, tuple) else str(value)
 
 
+# ------------------------------------------------------------------------------------ records
+
+
 def _split(separator: str) -> BeforeValidator:
     return BeforeValidator(lambda text: tuple(text.split(separator)) if text else ())
 

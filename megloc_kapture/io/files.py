@@ -25,6 +25,9 @@ from megloc_kapture.errors import DataError, MeglocError, OutputError, require
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
+# ------------------------------------------------------------------------------------ reading
+
+
 def read_content(path: Path | str) -> bytes:
     with reading(path):
         return Path(path).read_bytes()
@@ -91,6 +94,9 @@ def named(
         raise DataError(message, path=path, line=line) from error.__cause__
 
 
+# ------------------------------------------------------------------------------------ paths
+
+
 def has_control_characters(text: str) -> bool:
     """Return whether a text has characters that are invalid in names and lines (NUL, tab, ...)."""
     return not text.isprintable() and any(
@@ -126,6 +132,9 @@ def safe_join(root: Path, relative_text: str) -> Path:
     return Path(root) / check_relative(relative_text)
 
 
+# -------------------------------------------------------------------------------- temporary names
+
+
 TEMPORARY = ".megloc-"  # prefix of temporary names, which all readers skip
 
 
@@ -147,6 +156,9 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+# ------------------------------------------------------------------------------------ writing
 
 
 def output_error(path: Path | str, error: OSError) -> OutputError:
@@ -194,10 +206,16 @@ def write_bytes(path: Path | str, content: bytes) -> None:
         file.write(content)
 
 
+# ------------------------------------------------------------------------------------ folders
+
+
 def user_cache() -> Path:
     """Return the user's cache folder, which may not exist."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache) / "megloc-kapture"
+
+
+# -------------------------------------------------------------------------------------- links
 
 
 def link_as_text(path: Path) -> str:
@@ -275,6 +293,9 @@ def _new_link(link: Path) -> Iterator[None]:
     with writing(link):
         link.parent.mkdir(parents=True, exist_ok=True)
         yield
+
+
+# --------------------------------------------------------------------------------------- JSON
 
 
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:

@@ -251,6 +251,9 @@ def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
     require(number != 0, "not a video, or OpenCV cannot read its frames", path=video)
 
 
+# ------------------------------------------------------------------------------ photographs
+
+
 @dataclass(frozen=True)
 class Photo:
     """The header of a photograph; ``camera`` describes the stored pixels.

@@ -85,6 +85,9 @@ def read_transform(path: Path, *, comments: bool = False) -> RigidTransform:
         return transform_of([field for line in lines for field in fields_of(line)])
 
 
+# ------------------------------------------------------------------------------- camera lists
+
+
 _ROW = re.compile(
     rf"(?P<name>\S.*?)[\s,]+(?P<model>{'|'.join(CAMERA_MODEL_NUM_PARAMS)})[\s,]+(?P<numbers>.*)"
 )

@@ -156,6 +156,9 @@ def _shortest(value: float) -> str:
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 
+# --------------------------------------------------------------------------------------- text
+
+
 @contextlib.contextmanager
 def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterator[list[str]]]:
     """Read rows of stripped fields, without comments; errors in the block name file and line."""

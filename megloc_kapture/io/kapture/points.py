@@ -69,6 +69,9 @@ def write_points3d(root: Path, points: ArrayLike) -> None:
             file.write((pattern * len(block) % tuple(block.ravel().tolist())).encode())
 
 
+# ---------------------------------------------------------------------------- observations
+
+
 @dataclass(frozen=True, eq=False)
 class Observations:
     """Observations of 3D points, sorted by point; those of one point are in file order.
@@ -224,6 +227,9 @@ def _rows(keypoints_type: str, observations: Observations) -> Iterator[tuple[int
         yield int(points[begin]), keypoints_type, text
 
 
+# ----------------------------------------------------------------------------- covariances
+
+
 def write_point_covariances(root: Path, covariances: NDArray[np.float64]) -> None:
     """Write the covariances (N, 6) of points for keypoint noise of 1 px.
 
@@ -249,6 +255,9 @@ def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] |
         path=path,
     )
     return np.asarray(array)
+
+
+# ------------------------------------------------------------------------------------ viewers
 
 
 def write_ply(

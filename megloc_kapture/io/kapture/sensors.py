@@ -42,6 +42,9 @@ _HEADERS = {
 }
 
 
+# ------------------------------------------------------------------------------------ reading
+
+
 def read_kapture_data(root: Path) -> KaptureData:
     """Read and check ``sensors/`` of a kapture; only sensors.txt must exist."""
     folder = root / "sensors"
@@ -198,6 +201,9 @@ def unit_quaternion(
         return quat_wxyz
     w, x, y, z = quat_wxyz
     return (w / norm, x / norm, y / norm, z / norm)
+
+
+# ------------------------------------------------------------------------------------ writing
 
 
 def write_sensors(root: Path, data: KaptureData) -> None:

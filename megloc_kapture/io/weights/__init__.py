@@ -59,6 +59,9 @@ _Text = Annotated[str, StringConstraints(min_length=1)]
 _FileName = Annotated[str, AfterValidator(check_relative)]
 
 
+# ----------------------------------------------------------------------------------- registry
+
+
 class PublishedFile(Options):
     """One published file of a network's weights; None where a value is unknown."""
 
@@ -108,6 +111,9 @@ def lookup(name: str) -> Weights:
         hint = suggestion(name, registry(), listed="there are ")
         raise OptionError(f"no weights {name!r} in the registry; {hint}")
     return registry()[name]
+
+
+# ------------------------------------------------------------------------------------ folder
 
 
 class MissingWeightsError(DataError):
@@ -240,6 +246,9 @@ def describe(name: str, path: Path) -> WeightsFile:
 def sha256_of(file: WeightsFile) -> str:
     with reading(file.path), open(file.path, "rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+# ----------------------------------------------------------------------------------- reading
 
 
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
