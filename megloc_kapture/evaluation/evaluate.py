@@ -97,7 +97,7 @@ def evaluate(
     benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
     bounds = [
-        each if isinstance(each, Threshold) else Threshold.parse(str(each).strip("()[]"))
+        each if isinstance(each, Threshold) else Threshold.parse(", ".join(map(str, each)))
         for each in thresholds or ()
     ]
     return evaluate_results(

@@ -50,11 +50,11 @@ class MapKeypoints:
     pixel_origin: PixelOrigin
 
     def __contains__(self, image: str) -> bool:
-        return image in self._keypoints
+        return image in self.stored_keypoints
 
     def keypoints_px(self, image: str) -> NDArray[np.float32]:
         """Return keypoints float32 (N, 2 or more) of a map image."""
-        return self.to_colmap(self._keypoints.read(image))
+        return self.to_colmap(self.stored_keypoints.read(image))
 
     def to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
         """Convert x and y of keypoints from the map's convention to COLMAP's."""
@@ -69,13 +69,15 @@ class MapKeypoints:
     def has_descriptors(self, images: Collection[str]) -> bool:
         if self.name not in self.folder.types("descriptors"):
             return False
-        return all(image in self.stored_descriptors for image in images if image in self._keypoints)
+        return all(
+            image in self.stored_descriptors for image in images if image in self.stored_keypoints
+        )
 
     def extractor(self) -> PluginChoice | None:
         """Return the extractor plugin named by the type or its ``keypoints.txt``, or None."""
         names = [self.name, base_type(self.name)]
         if self.name in self.folder.types("keypoints"):
-            names.append(self._keypoints.config.name)
+            names.append(self.stored_keypoints.config.name)
         choice = next((choice for name in names if (choice := _extractor_named(name))), None)
         has_descriptors = self.name in self.folder.types("descriptors")
         if choice is not None and choice.name in _SIFT_OF.values() and has_descriptors:
@@ -87,12 +89,12 @@ class MapKeypoints:
         if not self.has_descriptors(images):
             return
         for image in images:
-            if image in self._keypoints:
-                check_lengths(self._keypoints, self.stored_descriptors, image)
+            if image in self.stored_keypoints:
+                check_lengths(self.stored_keypoints, self.stored_descriptors, image)
 
     # opening a reader lists folders or tar members, so readers are cached
     @cached_property
-    def _keypoints(self) -> FeatureReader:
+    def stored_keypoints(self) -> FeatureReader:
         return self.folder.keypoints(self.name)
 
     @cached_property

@@ -50,7 +50,7 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_
 from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
-from megloc_kapture.stages.local_features import mask_path
+from megloc_kapture.stages.local_features import check_lengths, mask_path
 from megloc_kapture.stages.scene import depth_of
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform, check_camera
 
@@ -289,7 +289,7 @@ class KaptureQueries(Queries):
 
 
 def _stored_features(stored: MapKeypoints, image: str) -> LocalFeatures:
-    stored.check([image])
+    check_lengths(stored.stored_keypoints, stored.stored_descriptors, image)
     keypoints_px = stored.keypoints_px(image)
     scores = np.zeros(len(keypoints_px), np.float32)
     return LocalFeatures(keypoints_px, scores, stored.descriptors(image))

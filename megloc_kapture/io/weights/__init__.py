@@ -252,7 +252,7 @@ def sha256_of(file: WeightsFile) -> str:
 
 
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
-    """Read the tensors of a checkpoint by name, without the prefix ``module.``.
+    """Read the tensors of a checkpoint by name, without prefixes such as ``module.``.
 
     No code in the file is executed. Files of ``torch.save`` are memory-mapped, so that the workers
     of one machine share the memory; ``nets.runtime.load_strictly`` recognises such tensors by
