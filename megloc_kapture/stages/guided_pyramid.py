@@ -45,7 +45,7 @@ from megloc_kapture.matching.guided_pyramid import (
     match_variants,
     pyramid_type,
 )
-from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
+from megloc_kapture.matching.pyramid_combination import KeypointUnion, combine
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     known_pose_of_variants,
@@ -147,15 +147,14 @@ def _described(skipped: Mapping[ImageVariant, str]) -> str:
     return "; ".join(f"{' '.join(map(str, some))}: {reason}" for reason, some in by_reason.items())
 
 
-def _counts(before: int = 0, combined: Combined | None = None) -> Counter[str]:
-    """Return counts for the log of a pair that was matched again, or of no pair."""
-    after = 0 if combined is None else len(combined.matches)
+def _counts(before: int = 0, after: int | None = None) -> Counter[str]:
+    """Return counts for the log from a pair's numbers of matches; None: it was not tried."""
     return Counter(
-        pairs_tried=int(combined is not None),
-        pairs_gained=int(after > before),
+        pairs_tried=int(after is not None),
+        pairs_gained=int((after or 0) > before),
         matches_before=before,
-        matches_after=after,
-        keypoints_added=0 if combined is None else sum(map(len, combined.added)),
+        matches_after=after or 0,
+        keypoints_added=0,
     )
 
 
@@ -264,19 +263,18 @@ def retry_query(
     matched, skipped = match_image_again(query, *frame(), hard, load, judge, method, name=name)
     of_other = dict(zip(hard, matched, strict=True))
     keypoints = KeypointUnion(query.keypoints_px)
-    descriptors: list[NDArray[Any]] = []
     richer: list[ImageMatches] = []
     counts = _counts()
     for other, pairs, scores in matches:
         if other in of_other:
-            variants = of_other[other]
-            of_image = [(0, each) for each in variants]
-            combined = combine((pairs, scores), of_image, mode, (keypoints, None))
-            counts.update(_counts(len(pairs), combined))
-            descriptors += [variants[at].descriptors[k] for at, k in combined.added[0].tolist()]
-            pairs, scores = combined.matches, combined.scores
+            variants = [(0, each) for each in of_other[other]]
+            before = len(pairs)
+            pairs, scores = combine((pairs, scores), variants, mode, [keypoints])
+            counts.update(_counts(before, len(pairs)))
         richer.append((other, pairs, scores))
-    added = np.array(descriptors, query.descriptors.dtype).reshape(-1, query.descriptors.shape[1])
+    added = np.array(keypoints.descriptors, query.descriptors.dtype)
+    added = added.reshape(-1, query.descriptors.shape[1])
+    counts["keypoints_added"] = len(added)
     return RetriedQuery(keypoints.added(), added, richer, counts, skipped)
 
 
@@ -327,7 +325,6 @@ def pyramid_mapping(
         for other, of_pair in zip(chain(*names), of_pairs, strict=True):
             matched_of[image, other] = of_pair, skipped
     unions: dict[str, KeypointUnion] = {}
-    added: dict[str, list[NDArray[Any]]] = defaultdict(list)  # descriptors
     counts, reasons, hard_pairs = _counts(), Counter[str](), set(hard)
     writer = MatchesWriter(output, pyramid_type(local_type), orphan=True)
     for pair in named:
@@ -340,16 +337,16 @@ def pyramid_mapping(
             for image in set(pair) - unions.keys():
                 unions[image] = KeypointUnion(keypoints.read(image))
             both = unions[pair[0]], unions[pair[1]]
-            combined = combine((matches, scores), variants, mode, both)
-            for image, new in zip(pair, combined.added, strict=True):
-                added[image] += [variants[at][1].descriptors[row] for at, row in new.tolist()]
+            before = len(matches)
+            matches, scores = combine((matches, scores), variants, mode, both)
             reasons[" | ".join(reason for _, reason in directed if reason)] += 1
-            counts.update(_counts(len(matches), combined))
-            matches, scores = combined.matches, combined.scores
+            counts.update(_counts(before, len(matches)))
         writer.write(*pair, matches, scores)
-    extended = sorted(image for image, descriptors in added.items() if descriptors)
+    extended = sorted(image for image, union in unions.items() if union.descriptors)
     for image in extended:
-        features.write(image, unions[image].added(), np.stack(added[image]))
+        descriptors = np.stack(unions[image].descriptors)
+        counts["keypoints_added"] += len(descriptors)
+        features.write(image, unions[image].added(), descriptors)
     features.write_rest()
     _warn_of_skipped(local_type, reasons)
     return {
