@@ -48,7 +48,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import KaptureVectors, feature_folder
-from megloc_kapture.retrieval.search import FusedSearch, FusionOptions
+from megloc_kapture.retrieval.search import FusionOptions, rank_rows
 from megloc_kapture.values import Camera, RigidTransform
 
 TYPE = "generated"
@@ -59,12 +59,10 @@ Vectors = NDArray[np.float32]
 Pairs = dict[str, dict[str, float]]
 
 
-def random_vectors(
-    seed: Sequence[int], count: int, dimension: int, out: Vectors | None = None
-) -> Vectors:
+def random_vectors(seed: Sequence[int], count: int, dimension: int) -> Vectors:
     """Generate random unit vectors (count, dimension)."""
     rng = np.random.default_rng(seed)
-    rows: Vectors = rng.standard_normal((count, dimension), dtype=np.float32, out=out)
+    rows: Vectors = rng.standard_normal((count, dimension), dtype=np.float32)
     rows /= np.sqrt(np.vecdot(rows, rows))[:, None]
     return rows
 
@@ -129,8 +127,7 @@ class Ours:
     def _search(self, images: Sequence[str], queries: Sequence[str]) -> Any:
         map_vectors = KaptureVectors(KaptureFolder(self.mapping).global_features(TYPE), images)
         query_vectors = KaptureVectors(KaptureFolder(self.query).global_features(TYPE), queries)
-        search = FusedSearch(self.top_k, FusionOptions())
-        return search.lists([query_vectors.read(0, len(queries))], [map_vectors])[0]
+        return rank_rows([query_vectors[:]], [map_vectors], self.top_k, FusionOptions())
 
 
 def pairs_of(path: Path) -> Pairs:
@@ -285,18 +282,12 @@ class GeneratedVectors:
     """Random unit vectors, generated on reading; row ``k * spacing`` is near query k."""
 
     def __init__(self, length: int, queries: Vectors) -> None:
-        self._length, self._queries = length, queries
+        self.shape, self._queries = (length, queries.shape[1]), queries
         self._spacing = length // len(queries)
 
-    def __len__(self) -> int:
-        return self._length
-
-    @property
-    def dimension(self) -> int:
-        return self._queries.shape[1]
-
-    def read(self, start: int, stop: int, out: Vectors | None = None) -> Vectors:
-        rows = random_vectors([2, start], stop - start, self.dimension, out)
+    def __getitem__(self, part: slice) -> Vectors:
+        start, stop, _ = part.indices(self.shape[0])
+        rows = random_vectors([2, start], stop - start, self.shape[1])
         for k in range(-(-start // self._spacing), len(self._queries)):
             row = k * self._spacing
             if row >= stop:
@@ -310,10 +301,9 @@ def million(options: argparse.Namespace) -> None:
     queries = random_vectors([1], options.queries, options.dimension)
     database = GeneratedVectors(options.million_images, queries)
     start = time.perf_counter()
-    search = FusedSearch(options.top_k, FusionOptions())
-    ((indices, _),) = search.lists([queries], [database])
+    indices, _ = rank_rows([queries], [database], options.top_k, FusionOptions())
     spent = time.perf_counter() - start
-    planted = np.arange(len(queries)) * (len(database) // len(queries))
+    planted = np.arange(len(queries)) * (database.shape[0] // len(queries))
     correct = int((indices[:, 0] == planted).sum())
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
     print(json.dumps({"seconds": spent, "gib": memory, "correct": correct}))

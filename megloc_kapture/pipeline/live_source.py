@@ -501,7 +501,7 @@ class MapMatching:
         images = self._map.images
         if kind.stored or kind.choice is None:
             (source,) = vectors_of([self._map.folder.global_features(kind.name)], images)
-            return source.read(0, len(source))
+            return source[:]
         if kind.is_vlad:
             vocabulary, settings = self._vlad(kind)
             local = self.types[self._position(settings.local_type)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -22,44 +21,18 @@ Matrices = Sequence[NDArray[np.floating[Any]]]
 Found = tuple[NDArray[np.int64], Float32]
 
 
-class VectorBlocks(Protocol):
-    """Unit-norm rows of a database, read in blocks; zero for images without features."""
-
-    def __len__(self) -> int: ...
+class VectorRows(Protocol):
+    """Unit-norm rows (M, D): an array, or read block by block; zero for images without features."""
 
     @property
-    def dimension(self) -> int: ...
+    def shape(self) -> tuple[int, ...]: ...
 
-    def read(self, start: int, stop: int) -> Float32:
-        """Return rows float32 (stop - start, D)."""
-        ...
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
 
 
-VectorSource = VectorBlocks | NDArray[np.floating[Any]]
-
-
-class ArrayBlocks:
-    def __init__(self, rows: NDArray[np.floating[Any]]) -> None:
-        self._rows = rows
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @property
-    def dimension(self) -> int:
-        return self._rows.shape[1]
-
-    def read(self, start: int, stop: int) -> Float32:
-        return np.ascontiguousarray(self._rows[start:stop], dtype=np.float32)
-
-
-def as_blocks(source: VectorSource) -> VectorBlocks:
-    return ArrayBlocks(source) if isinstance(source, np.ndarray) else source
-
-
-def common_length(sources: Sequence[VectorBlocks]) -> int:
+def common_length(sources: Sequence[VectorRows]) -> int:
     """Return the number of rows of all sources; DataError if they differ."""
-    lengths = {len(source) for source in sources}
+    lengths = {source.shape[0] for source in sources}
     if len(lengths) != 1:
         raise DataError(
             f"global features of the same images differ in their number of rows: {sorted(lengths)}"
@@ -67,69 +40,50 @@ def common_length(sources: Sequence[VectorBlocks]) -> int:
     return lengths.pop()
 
 
-@dataclass(frozen=True)
-class FusedSearch:
-    """Search for the ``top_k`` best database rows by one or several global features."""
+def rank_rows(
+    queries: Sequence[NDArray[np.floating[Any]]],
+    database: Sequence[VectorRows],
+    top_k: int,
+    fusion: FusionOptions,
+    weights: Sequence[float] | None = None,
+) -> Found:
+    """Rank the rows of a database by one or several global features.
 
-    top_k: int
-    fusion: FusionOptions
-    weights: Sequence[float] | None = None
-
-    def lists(
-        self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
-    ) -> list[Found]:
-        """Return one ranking of the rows, or one per feature if ranks are to be fused.
-
-        ``queries`` and ``database`` have arrays (Q, D_i) and (M, D_i) per feature. A ranking has
-        indices int64 (Q, min(K, M)), best first, ties in database order, and scores float32; K is
-        ``top_k``, or more if ranks are to be fused.
-        """
-        if len(queries) == 0 or len(queries) != len(database):
-            raise OptionError(
-                f"the queries have {len(queries)} global features, the map has {len(database)}"
-            )
-        normalized_weights(self.weights, len(queries))  # check before reading
-        if len(queries) == 1 or self.fusion.fuses_ranks():
-            return _search(queries, database, self._list_length(), lambda matrices: matrices)
-
-        def fused(matrices: Matrices) -> Matrices:
-            return [fuse(matrices, self.fusion, self.weights)]
-
-        return _search(queries, database, self.top_k, fused)
-
-    def find(
-        self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
-    ) -> Found:
-        """Rank the rows: indices and scores (Q, min(top_k, M)); see :meth:`lists`."""
-        lists = self.lists(queries, database)
-        if len(lists) == 1:
-            indices, scores = lists[0]
-            return indices[:, : self.top_k], scores[:, : self.top_k]
+    ``queries`` and ``database`` are (Q, D_i) and (M, D_i) per feature. Returns indices int64
+    (Q, min(top_k, M)), best first, ties in database order, and scores float32.
+    """
+    if len(queries) == 0 or len(queries) != len(database):
+        raise OptionError(
+            f"the queries have {len(queries)} global features, the map has {len(database)}"
+        )
+    normalized_weights(weights, len(queries))  # check before reading
+    if len(queries) == 1:
+        return _search(queries, database, top_k, lambda matrices: matrices)[0]
+    if fusion.method == "reciprocal_rank":
+        length = max(top_k, _RANKED_IMAGES)
+        lists = _search(queries, database, length, lambda matrices: matrices)
         rankings = [indices for indices, _ in lists]
-        return fuse_rankings(rankings, min(self.top_k, rankings[0].shape[1]), self.weights)
-
-    def _list_length(self) -> int:
-        return max(self.top_k, RANKED_IMAGES if self.fusion.fuses_ranks() else 0)
+        return fuse_rankings(rankings, min(top_k, rankings[0].shape[1]), weights)
+    return _search(queries, database, top_k, lambda matrices: [fuse(matrices, fusion, weights)])[0]
 
 
 def _search(
     queries: Sequence[NDArray[np.floating[Any]]],
-    database: Sequence[VectorSource],
+    database: Sequence[VectorRows],
     length: int,
     combine: Callable[[Matrices], Matrices],
 ) -> list[Found]:
     """Rank at most ``length`` rows by each matrix of scores that ``combine`` returns."""
-    sources = [as_blocks(source) for source in database]
-    vectors = [_checked(rows, source) for rows, source in zip(queries, sources, strict=True)]
-    num_queries, num_rows = len(vectors[0]), common_length(sources)
-    step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
+    vectors = [_checked(rows, source) for rows, source in zip(queries, database, strict=True)]
+    num_queries, num_rows = len(vectors[0]), common_length(database)
+    step = _VECTOR_ELEMENTS // max(1, *(source.shape[1] for source in database))
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
     queries_per_block = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
-    num_rankings = len(combine([np.zeros((0, 0), np.float32)] * len(sources)))
+    num_rankings = len(combine([np.zeros((0, 0), np.float32)] * len(database)))
     best = [_BestRows(num_queries, min(length, num_rows)) for _ in range(num_rankings)]
     for left in range(0, num_rows, step) if num_queries else ():
         right = min(left + step, num_rows)
-        blocks = [source.read(left, right) for source in sources]
+        blocks = [np.ascontiguousarray(source[left:right], np.float32) for source in database]
         for first in range(0, num_queries, queries_per_block):
             block_queries = slice(first, first + queries_per_block)
             products = [
@@ -140,12 +94,12 @@ def _search(
     return [(ranking.rows, ranking.scores) for ranking in best]
 
 
-def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> Float32:
+def _checked(queries: NDArray[np.floating[Any]], source: VectorRows) -> Float32:
     rows = np.ascontiguousarray(queries, dtype=np.float32)
-    if rows.ndim != 2 or rows.shape[1] != source.dimension:
-        of_map = (len(source), source.dimension)
+    if rows.ndim != 2 or rows.shape[1] != source.shape[1]:
         raise DataError(
-            f"global descriptors of queries {rows.shape} and map {of_map} have different dimensions"
+            f"global descriptors of queries {rows.shape} and map {source.shape} have different "
+            "dimensions"
         )
     return rows
 
@@ -192,7 +146,7 @@ def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]
 FusionMethod = Literal["ghm", "mean", "early", "reciprocal_rank"]
 _GAMMA = 0.5  # kapture-localization's default
 _RANK_CONSTANT = 60  # the value of Cormack et al.
-RANKED_IMAGES = 200  # smallest length of the ranking per feature in reciprocal rank fusion
+_RANKED_IMAGES = 200  # smallest length of the ranking per feature in reciprocal rank fusion
 Similarities = NDArray[np.floating[Any]]
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 
@@ -205,9 +159,6 @@ class FusionOptions(Options):
         description="ghm: generalized harmonic mean of the similarities; mean or early: their "
         "weighted mean, as for concatenated vectors; reciprocal_rank: fusion of ranks",
     )
-
-    def fuses_ranks(self) -> bool:
-        return self.method == "reciprocal_rank"
 
 
 def fuse(

@@ -30,10 +30,10 @@ from megloc_kapture.mapping.pairs import (
 )
 from megloc_kapture.retrieval.search import (
     Found,
-    FusedSearch,
     FusionOptions,
-    as_blocks,
+    VectorRows,
     common_length,
+    rank_rows,
 )
 from megloc_kapture.stages.scene import check_points
 from megloc_kapture.stages.stage import (
@@ -109,7 +109,6 @@ class Restrictions:
 UNRESTRICTED = Restrictions()
 
 
-Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
 _QUERY_ELEMENTS = 1 << 27  # elements of query vectors in memory at once: 512 MiB of float32
 
 
@@ -135,8 +134,8 @@ class Retrieval:
 
     def rank(
         self,
-        queries: Sequence[Vectors],
-        database: Sequence[Vectors],
+        queries: Sequence[VectorRows],
+        database: Sequence[VectorRows],
         top_k: int,
     ) -> Found:
         """Return indices and scores, (Q, at most ``top_k``), of the most similar database rows.
@@ -144,14 +143,12 @@ class Retrieval:
         ``queries`` and ``database`` have the unit vectors of each type as rows; they are read in
         blocks.
         """
-        search = FusedSearch(top_k, self.fusion, self.weights or None)
-        asked = [as_blocks(source) for source in queries]
-        total, width = common_length(asked), sum(source.dimension for source in asked)
+        total, width = common_length(queries), sum(source.shape[1] for source in queries)
         step = max(1, _QUERY_ELEMENTS // max(width, 1))
         blocks = []
         for start in range(0, total, step) or (0,):
-            rows = [source.read(start, min(start + step, total)) for source in asked]
-            blocks.append(search.find(rows, database))
+            rows = [source[start : start + step] for source in queries]
+            blocks.append(rank_rows(rows, database, top_k, self.fusion, self.weights or None))
         indices, scores = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
         return indices, scores
 
@@ -169,8 +166,8 @@ def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[
 
 
 def most_similar(
-    queries: Sequence[Vectors],
-    database: Sequence[Vectors],
+    queries: Sequence[VectorRows],
+    database: Sequence[VectorRows],
     permitted: NDArray[np.int64],
     retrieval: Retrieval,
     top_k: int,

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval import search
-from megloc_kapture.retrieval.search import Found, FusedSearch, FusionOptions, fuse
+from megloc_kapture.retrieval.search import Found, FusionOptions, fuse, rank_rows
 
 
 def rank_by_similarity(queries: Any, database: Any, top_k: int) -> Found:
-    return FusedSearch(top_k, FusionOptions()).find([queries], [database])
+    return rank_rows([queries], [database], top_k, FusionOptions())
 
 
 @st.composite
@@ -61,7 +61,7 @@ def test_fused_ranking_equals_whole_matrices(method: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "_BLOCK_ELEMENTS", 48)
         patch.setattr(search, "_MOST_ROWS", 13)
-        indices, scores = FusedSearch(10, options, weights).find(queries, database)
+        indices, scores = rank_rows(queries, database, 10, options, weights)
     assert indices.shape == scores.shape == (7, 10)
     for row in range(7):
         matrices = [q[row : row + 1] @ m.T for q, m in zip(queries, database, strict=True)]
@@ -89,4 +89,4 @@ TWO_ROWS, THREE_ROWS, WIDE = np.zeros((2, 4)), np.zeros((3, 4)), np.zeros((3, 5)
 )
 def test_inconsistent_features_are_refused(queries: Any, database: Any, message: str) -> None:
     with pytest.raises((DataError, OptionError), match=message):
-        FusedSearch(1, FusionOptions()).find(queries, database)
+        rank_rows(queries, database, 1, FusionOptions())

@@ -297,17 +297,14 @@ class KaptureVectors:
         self._reader = reader
         self._images = images
 
-    def __len__(self) -> int:
-        return len(self._images)
-
     @property
-    def dimension(self) -> int:
-        return self._reader.config.dsize
+    def shape(self) -> tuple[int, int]:
+        return len(self._images), self._reader.config.dsize
 
-    def read(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Read unit rows of the images ``start`` to ``stop``, (stop - start, D)."""
-        images = self._images[start:stop]
-        rows = np.empty((len(images), self.dimension), np.float32)
+    def __getitem__(self, part: slice) -> NDArray[np.float32]:
+        """Read the unit rows of a part of the images, (N, D)."""
+        images = self._images[part]
+        rows = np.empty((len(images), self.shape[1]), np.float32)
         for row, image in zip(rows, images, strict=True):
             row[:] = self._reader.read_unchecked(image)
         squared = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)

@@ -30,15 +30,15 @@ def test_blocks_hold_unit_rows_in_the_order_of_the_images(tmp_path: Path) -> Non
     expected = np.array([features.read(image) for image in images], dtype=np.float32)
     unit = expected / np.linalg.norm(expected, axis=1)[:, None]
     blocks = KaptureVectors(features, images)
-    assert len(blocks) == len(images) and blocks.dimension == 5
-    np.testing.assert_allclose(blocks.read(0, len(images)), unit, atol=1e-6)
-    np.testing.assert_allclose(blocks.read(3, 12), unit[3:12], atol=1e-6)
+    assert blocks.shape == (len(images), 5)
+    np.testing.assert_allclose(blocks[:], unit, atol=1e-6)
+    np.testing.assert_allclose(blocks[3:12], unit[3:12], atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e37])
 def test_rows_have_unit_length_at_any_scale(tmp_path: Path, scale: float) -> None:
     rows = np.array([[3, 4], [0, 0], [1, 0]]) * scale
-    read = KaptureVectors(write(tmp_path, rows.astype(np.float32)), NAMES[:3]).read(0, 3)
+    read = KaptureVectors(write(tmp_path, rows.astype(np.float32)), NAMES[:3])[:3]
     expected = [[0.6, 0.8], [0, 0], [1, 0]] if scale else np.zeros((3, 2))
     np.testing.assert_allclose(read, expected, atol=1e-6)
 
@@ -48,6 +48,6 @@ def test_images_without_a_usable_vector_are_named(tmp_path: Path) -> None:
     rows[1, 2] = np.nan
     features = write(tmp_path, rows)
     with pytest.raises(DataError, match=rf"{NAMES[1]}.* not all values are finite"):
-        KaptureVectors(features, NAMES[:3]).read(0, 3)
+        KaptureVectors(features, NAMES[:3])[:3]
     with pytest.raises(DataError, match=r"no global_features of type 'G' for image 'no\.jpg'"):
-        KaptureVectors(features, ["no.jpg"]).read(0, 1)
+        KaptureVectors(features, ["no.jpg"])[:1]
