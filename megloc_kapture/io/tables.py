@@ -227,7 +227,7 @@ class ConsistencyRow:
     """One row of ``map_consistency.csv``: a refiner's check of one coordinate frame of a map.
 
     ``moved_m`` to ``squared_distance`` are medians over the tested images, NaN without such images;
-    see ``megloc_kapture.refinement.references.Displacement``. ``reason`` says why query poses are
+    see ``megloc_kapture.refinement.references.DISPLACEMENT``. ``reason`` says why query poses are
     not refined; it is empty if they are.
     """
 

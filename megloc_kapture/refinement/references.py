@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +41,15 @@ _MIN_PARALLAX = 0.1
 _NEAREST, _BEST = 200, 6
 _ASKED_POINTS = 300
 _MIN_SHARED = 0.1
+DISPLACEMENT = (
+    *("moved_m", "turned_deg", "moved_px"),
+    *("claimed_m", "claimed_deg", "squared_distance"),
+)
+"""Measures of a refinement that tell how far it moved a map image, whose pose is presumed correct.
+
+``claimed_m`` and ``claimed_deg`` are standard deviations of the refined pose by its estimated
+covariance; ``squared_distance`` is the squared Mahalanobis distance.
+"""
 # smallest displacement that alignment resolves, in pixels of the finest level: it converges to
 # 0.01 px, and images with exact poses move by up to 0.02 px
 _RESOLVED_PX = 0.05
@@ -106,42 +114,11 @@ def pyramid_of(view: PosedImage, options: RenderingOptions) -> list[Level]:
 
 
 @dataclass(frozen=True)
-class Displacement:
-    """Displacement of a map image when its pose, presumably correct, is refined."""
-
-    moved_m: float
-    turned_deg: float
-    moved_px: float
-    # claimed_m, claimed_deg: standard deviations of the refined pose by its estimated covariance
-    claimed_m: float
-    claimed_deg: float
-    squared_distance: float  # squared Mahalanobis distance by that covariance
-
-    @property
-    def contradicts(self) -> bool:
-        return self.squared_distance > CHI2_OF_CHANCE and self.moved_px > _RESOLVED_PX
-
-
-@dataclass(frozen=True)
 class Consistency:
     images: int
     contradicting: int
-    # median of each component; None if no image was tested
-    median: Displacement | None
+    medians: dict[str, float]  # of each of DISPLACEMENT; NaN if no image was tested
     reason: str  # why the map is inconsistent; empty if it is consistent
-
-
-@runtime_checkable
-class HoldsOut(Protocol):
-    name: str
-    require_consistent_map: bool
-    """If true, poses may be refined only in a map that is tested to be consistent."""
-
-    def hold_out(
-        self, image: str, images: ReferenceImages, scene: RankingScene
-    ) -> Displacement | None:
-        """Return the displacement of a map image; None if other images do not determine it."""
-        ...
 
 
 def spread_names(names: Sequence[str]) -> list[str]:
@@ -152,23 +129,26 @@ def spread_names(names: Sequence[str]) -> list[str]:
     return [names[row] for row in order if row < len(names)][:MAX_TRIED]
 
 
-def judge_consistency(displacements: Iterable[Displacement | None]) -> Consistency:
-    """Judge a map by at most ``MAX_TESTED`` displacements of held-out images."""
-    known: list[Displacement] = []
+def contradicts(displacement: Mapping[str, float]) -> bool:
+    return (
+        displacement["squared_distance"] > CHI2_OF_CHANCE
+        and displacement["moved_px"] > _RESOLVED_PX
+    )
+
+
+def judge_consistency(displacements: Iterable[Mapping[str, float] | None]) -> Consistency:
+    """Judge a map by at most ``MAX_TESTED`` displacements (DISPLACEMENT) of held-out images."""
+    known: list[Mapping[str, float]] = []
     for each in displacements:
         if each is not None:
             known.append(each)
             if len(known) == MAX_TESTED:
                 break
     if not known:
-        return Consistency(
-            0, 0, None, "no map image with depth overlaps with images from other viewpoints"
-        )
-    names = Displacement.__dataclass_fields__
-    median = Displacement(
-        *(float(np.median([getattr(each, name) for each in known])) for name in names)
-    )
-    contradicting = sum(each.contradicts for each in known)
+        reason = "no map image with depth overlaps with images from other viewpoints"
+        return Consistency(0, 0, dict.fromkeys(DISPLACEMENT, np.nan), reason)
+    medians = {name: float(np.median([each[name] for each in known])) for name in DISPLACEMENT}
+    contradicting = sum(map(contradicts, known))
     reason = ""
     if len(known) < MIN_TESTED:
         reason = (
@@ -178,10 +158,10 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
     elif 2 * contradicting > len(known):
         reason = (
             f"the map contradicts itself: {contradicting} of {len(known)} held-out images would "
-            f"move by more than their uncertainty; the median motion is {median.moved_m:.3f} m, "
-            f"{median.turned_deg:.2f} deg, {median.moved_px:.1f} px"
+            f"move by more than their uncertainty; the median motion is {medians['moved_m']:.3f} "
+            f"m, {medians['turned_deg']:.2f} deg, {medians['moved_px']:.1f} px"
         )
-    return Consistency(len(known), contradicting, median, reason)
+    return Consistency(len(known), contradicting, medians, reason)
 
 
 def references_elsewhere(

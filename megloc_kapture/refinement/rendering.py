@@ -31,7 +31,6 @@ from megloc_kapture.refinement.photometric import (
 )
 from megloc_kapture.refinement.pyramid import Seen, choose_points, usable_cells, visibility
 from megloc_kapture.refinement.references import (
-    Displacement,
     ReferenceImages,
     lifted,
     pyramid_of,
@@ -75,28 +74,6 @@ def judge_by_rendering(
     ``judged`` bool (H, W) are the query's pixels that acceptance uses, by default all.
     """
     return _Refining(query, references, options).judge(refined, judged)
-
-
-def displacement_by_rendering(
-    image: PosedImage, references: Sequence[PosedImage], options: RenderingOptions
-) -> Displacement | None:
-    """Return how far :func:`refine_by_rendering` moves a presumably correct pose.
-
-    If the result is rejected, the displacement is that of the nearest minimum. None if overlap or
-    correlation is too small, the images do not determine the pose, or the minimum is out of bounds.
-    """
-    refiner = _Refining(image, references, options)
-    refined = refiner.refine()
-    if not refined.accepted:
-        refined = refiner.judge(image.cam_from_world, None)
-    result = refined.measures
-    if "squared_distance" not in result or (
-        result["moved_m"] > options.max_translation_m
-        or result["turned_deg"] > options.max_rotation_deg
-        or result["correlation_after"] < options.min_correlation
-    ):
-        return None
-    return Displacement(**{name: result[name] for name in Displacement.__dataclass_fields__})
 
 
 class _Refining:
@@ -208,7 +185,13 @@ class Rendering:
 
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
-    ) -> Displacement | None:
+    ) -> dict[str, float] | None:
+        """Return measures of how far refinement moves a map image, see ``DISPLACEMENT``.
+
+        If the refined pose is rejected, they are those of the nearest minimum. None if overlap or
+        correlation is too small, other images do not determine the pose, or the minimum is out of
+        bounds.
+        """
         view = image_with_depth(image, scene)
         if view is None:
             return None
@@ -216,7 +199,18 @@ class Rendering:
         if not references:
             return None
         options = self.options.model_copy(update={"accept_always": False})
-        return displacement_by_rendering(view, references, options)
+        refiner = _Refining(view, references, options)
+        refined = refiner.refine()
+        if not refined.accepted:
+            refined = refiner.judge(view.cam_from_world, None)
+        measures = refined.measures
+        if "squared_distance" not in measures or (
+            measures["moved_m"] > options.max_translation_m
+            or measures["turned_deg"] > options.max_rotation_deg
+            or measures["correlation_after"] < options.min_correlation
+        ):
+            return None
+        return dict(measures)
 
     def refine(
         self,

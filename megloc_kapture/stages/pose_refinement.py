@@ -6,9 +6,10 @@ import shutil
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
@@ -38,8 +39,6 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.refinement.references import (
     Consistency,
-    Displacement,
-    HoldsOut,
     ReferenceImages,
     judge_consistency,
     spread_names,
@@ -127,12 +126,12 @@ class MapRefiners:
             for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
                 self._verdicts[frame] = [
                     self._judge(refiner, self._by_frame[frame], work)
-                    if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
+                    if getattr(refiner, "require_consistent_map", False)
                     else None
                     for refiner in self.refiners
                 ]
 
-    def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
+    def _judge(self, refiner: Any, images: ReferenceImages, work: Work) -> Consistency:
         hold_out, spread = partial(_hold_out, self.map, refiner, images), spread_names(images.names)
         return judge_consistency(ordered_map(hold_out, spread, work.executor, window=_WINDOW))
 
@@ -170,15 +169,21 @@ class MapRefiners:
 
 
 def _hold_out(
-    mapping: KaptureFolder, refiner: HoldsOut, images: ReferenceImages, image: str
-) -> Displacement | None:
-    return refiner.hold_out(image, images, KaptureScene(mapping))
+    mapping: KaptureFolder, refiner: Any, images: ReferenceImages, image: str
+) -> dict[str, float] | None:
+    displacement: dict[str, float] | None = refiner.hold_out(image, images, KaptureScene(mapping))
+    return displacement
 
 
 def _consistency_row(frame: str, method: str, consistency: Consistency) -> ConsistencyRow:
-    median = consistency.median or Displacement(*[float("nan")] * len(fields(Displacement)))
-    counts = (consistency.images, consistency.contradicting)
-    return ConsistencyRow(frame, method, *counts, **vars(median), reason=consistency.reason)
+    return ConsistencyRow(
+        frame,
+        method,
+        consistency.images,
+        consistency.contradicting,
+        **consistency.medians,
+        reason=consistency.reason,
+    )
 
 
 def apply_refiners(

@@ -36,7 +36,7 @@ from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatc
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PoseHypothesis, PoseRefinement, RankingScene
-from megloc_kapture.refinement.references import Displacement
+from megloc_kapture.refinement.references import DISPLACEMENT
 from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
@@ -241,10 +241,10 @@ class Sure(Shift):
         super().__init__(name="sure")
         self.require_consistent_map = require_consistent_map
 
-    def hold_out(self, image: str, images: Any, scene: Any) -> Displacement | None:
+    def hold_out(self, image: str, images: Any, scene: Any) -> dict[str, float] | None:
         assert scene.map_pose(image) is not None and image in images.names
         off = FRAMES["good" if int(image.removesuffix(".png")) < 6 else "bad"]
-        return Displacement(0.02, 0.2, 3.0, 0.001, 0.01, off)
+        return dict(zip(DISPLACEMENT, (0.02, 0.2, 3.0, 0.001, 0.01, off), strict=True))
 
 
 # frame of a map image: standardised error of held-out map images
