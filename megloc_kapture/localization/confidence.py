@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import focal_px, project
 from megloc_kapture.localization.absolute_pose import center_deviation, match_errors
-from megloc_kapture.localization.focal_length import FocalMisfit
 from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -121,12 +120,13 @@ def with_confidence(
     sources: MatchSources,
     max_error_px: float,
     min_confidence: float,
-    misfit: FocalMisfit | None = None,
+    misfit: tuple[str, float] | None = None,
 ) -> Pose | Failure:
     """Return the pose with its confidence and evidence, or a Failure if the confidence is too low.
 
-    A wrong focal length (``misfit``) shifts the camera. The confidence is divided by the square of
-    this shift relative to 3 % of the distance to the points, if it is larger.
+    A wrong focal length shifts the camera (``misfit``, see :func:`~.focal_length.focal_misfit`).
+    The confidence is divided by the square of this shift relative to 3 % of the distance to the
+    points, if it is larger.
     """
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
@@ -136,8 +136,8 @@ def with_confidence(
     if MAP_POINTS in evidence and confidence >= min_confidence * evidence[MAP_POINTS]:
         why = "the map has too few points in the camera's view"
     if misfit is not None:
-        confidence *= (_TOLERATED_SHIFT / max(misfit.shift, _TOLERATED_SHIFT)) ** 2
-        why = misfit.remark
+        why, shift = misfit
+        confidence *= (_TOLERATED_SHIFT / max(shift, _TOLERATED_SHIFT)) ** 2
         remarks = (*remarks, why)
     if confidence >= min_confidence:
         return replace(pose, confidence=confidence, evidence=evidence, remarks=remarks)
@@ -147,7 +147,7 @@ def with_confidence(
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
         confidence=confidence,
-        remarks=() if misfit is None else (misfit.remark,),
+        remarks=() if misfit is None else misfit[:1],
     )
 
 

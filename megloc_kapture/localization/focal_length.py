@@ -99,30 +99,20 @@ def is_uncertain(problem: PoseProblem) -> bool:
     return len(problem.views) == 1 and problem.views[0].camera.focal_deviation > 0
 
 
-@dataclass(frozen=True)
-class FocalMisfit:
-    """Remark on a focal length that fits far better than the given one.
-
-    ``shift`` is the resulting motion of the camera centre, divided by the median distance of the
-    inliers.
-    """
-
-    remark: str
-    shift: float
-
-
 def focal_misfit(
     problem: PoseProblem, pose: Pose, options: AbsolutePoseOptions
-) -> FocalMisfit | None:
-    """Return another focal length if it fits far better than the given one.
+) -> tuple[str, float] | None:
+    """Return a remark if another focal length fits far better than the given one.
 
-    Also None for rigs, for few inliers, and if the matches do not determine the focal length.
+    The second value is the resulting motion of the camera centre, divided by the median distance of
+    the inliers. Also None for rigs, for few inliers, and if the matches do not determine the focal
+    length.
     """
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
     given = problem.views[0].camera
-    fit = _freed(problem, pose.cam_from_world, pose.inliers, options.max_error_px)
-    if fit is None or not fit.contradicts(given):
+    fit = _freed(problem, given, pose.cam_from_world, pose.inliers, options.max_error_px)
+    if fit is None or not fit.contradicts:
         return None
     # the inliers of a grossly wrong focal length favour it, so search again among all matches
     free = focal_from_matches(
@@ -133,16 +123,15 @@ def focal_misfit(
         estimate = estimate_pose(other, options)
         if isinstance(estimate, PoseEstimate):
             start = estimate.rig_from_world, estimate.inliers
-            second = _freed(other, *start, options.max_error_px)
+            second = _freed(other, given, *start, options.max_error_px)
             if second is not None and second.cost < fit.cost:
                 fit = second
-    if not fit.contradicts(given):
+    if not fit.contradicts:
         return None
-    deviation_px = fit.focal_px * fit.deviation_from(given)
     shift = np.linalg.norm(fit.rig_from_world.center() - pose.cam_from_world.center())
-    return FocalMisfit(
+    return (
         f"the focal length of {focal_px(given):.0f} px {_DOES_NOT_FIT}: {fit.focal_px:.0f} +- "
-        f"{deviation_px:.0f} px would",
+        f"{fit.focal_px * fit.deviation:.0f} px would",
         float(shift) / fit.distance,
     )
 
@@ -151,30 +140,23 @@ def focal_misfit(
 class _Freed:
     """Pose and focal length estimated together.
 
-    ``deviation``: relative standard deviation of the focal length.
-    ``cost``: sum of squared errors of all matches, truncated at the inlier threshold; ``distance``:
-    median distance of the inliers from the camera.
+    ``deviation``: relative standard deviation of the focal length's change, with calibration error
+    and bias; ``contradicts``: the change is significant; ``cost``: sum of squared errors of all
+    matches, truncated at the inlier threshold; ``distance``: median distance of the inliers from
+    the camera.
     """
 
     focal_px: float
     deviation: float
+    contradicts: bool
     rig_from_world: RigidTransform
     cost: float
     distance: float
 
-    def change_from(self, given: Camera) -> float:
-        return math.log(self.focal_px / focal_px(given))
-
-    def deviation_from(self, given: Camera) -> float:
-        """Return the standard deviation of the change, with calibration error and bias."""
-        return math.hypot(self.deviation, _CALIBRATED, _BIASED_BY * self.change_from(given))
-
-    def contradicts(self, given: Camera) -> bool:
-        return abs(self.change_from(given)) >= _MIN_SIGMAS * self.deviation_from(given)
-
 
 def _freed(
     problem: PoseProblem,
+    given: Camera,
     rig_from_world: RigidTransform,
     inliers: NDArray[np.bool_],
     max_error_px: float,
@@ -209,9 +191,14 @@ def _freed(
             return None
         if (before == inliers).all():
             break
+    estimated_px = focal * math.exp(change[0])
+    from_given = math.log(estimated_px / focal_px(given))
+    alone = math.sqrt(covariance[6, 6] * (1 + inliers.sum() / _INDEPENDENT))
+    deviation = math.hypot(alone, _CALIBRATED, _BIASED_BY * from_given)
     return _Freed(
-        focal_px=focal * math.exp(change[0]),
-        deviation=math.sqrt(covariance[6, 6] * (1 + inliers.sum() / _INDEPENDENT)),
+        focal_px=estimated_px,
+        deviation=deviation,
+        contradicts=abs(from_given) >= _MIN_SIGMAS * deviation,
         rig_from_world=view.cam_from_rig.inverse() @ moved,
         cost=float((np.minimum(errors_px, max_error_px) ** 2).sum()),
         distance=float(np.median(np.linalg.norm(in_camera[inliers], axis=1))),

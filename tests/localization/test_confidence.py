@@ -22,7 +22,6 @@ from megloc_kapture.localization.confidence import (
     evidence_of,
     with_confidence,
 )
-from megloc_kapture.localization.focal_length import FocalMisfit
 from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -116,7 +115,7 @@ def test_a_pose_of_random_matches_is_rejected() -> None:
 def test_a_focal_length_that_does_not_fit_lowers_the_confidence() -> None:
     problem, pose, sources = scene(100, 60)
     alone = with_confidence(problem, pose, sources, ERROR_PX, 0.6)
-    near, far = FocalMisfit("remark", 0.03), FocalMisfit("remark", 0.06)
+    near, far = ("remark", 0.03), ("remark", 0.06)
     kept = with_confidence(problem, pose, sources, ERROR_PX, 0.6, near)
     assert isinstance(kept, Pose) and kept.remarks == ("remark",)
     assert kept.confidence == alone.confidence
