@@ -158,8 +158,8 @@ class Densify(Reading, Choosing, Working):
             keep_unit(source.root, out)
             console.say(counts_text(counts))
             if self.fuse is not None:
-                agreement = fitted_to_poses(source, options.max_size_px).agreement
-                fused = fuse_depth(KaptureFolder(out), self.fuse, agreement, work=work)
+                tolerance_px = fitted_to_poses(source, options.max_size_px).tolerance_px
+                fused = fuse_depth(KaptureFolder(out), self.fuse, tolerance_px, work=work)
                 console.say(f"{fused} points in {self.fuse}")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -30,6 +30,9 @@ _MIN_REGION_PX = 40  # in smaller islands, views agree by chance
 # number of other views that must confirm a pixel; with 2, a tenth of the pixels are lost, and the
 # share of depths with an error below 2 cm rises by only one percent
 _MIN_VIEWS = 1
+# views agree within this distance of a pixel from its projection to another view and back, and this
+# relative difference in depth per pixel of that distance (docs/experiments/mvs.md)
+TOLERANCE_PX, _RELATIVE_PER_PX = 1.0, 0.01
 # largest relative standard deviation of depth; surfaces without texture exceed it
 _MAX_RELATIVE_SIGMA = 0.03
 
@@ -154,25 +157,11 @@ def depth_range(depths: Floats) -> tuple[float, float] | None:
     return float(low * _WIDENED[0]), float(high * _WIDENED[1])
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Largest difference between the depths of two views, see docs/experiments/mvs.md.
-
-    Attributes
-    ----------
-    max_error_px : distance between a pixel and its projection to another view and back.
-    max_relative_error : relative difference in depth.
-    """
-
-    max_error_px: float = 1.0
-    max_relative_error: float = 0.01
-
-
 def agreeing_views(
     view: StereoView,
     depth_m: NDArray[np.float32],
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
-    agreement: Agreement,
+    tolerance_px: float = TOLERANCE_PX,
 ) -> NDArray[np.uint8]:
     """Count the other views (H, W) whose depth agrees when projected there and back."""
     from megloc_kapture.mvs.kernels import count_agreeing
@@ -181,7 +170,7 @@ def agreeing_views(
     inverse = _inverted(depth_m)
     for other, other_depth_m in others:
         forth, back = relative_projection(view, other), relative_projection(other, view)
-        limits = agreement.max_error_px, agreement.max_relative_error
+        limits = tolerance_px, _RELATIVE_PER_PX * tolerance_px
         count_agreeing(inverse, _inverted(other_depth_m), *forth, *back, *limits, counts)
     return counts
 
@@ -211,10 +200,10 @@ def confirmed(
     view: StereoView,
     estimate: DepthEstimate,
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
-    agreement: Agreement,
+    tolerance_px: float = TOLERANCE_PX,
 ) -> DepthEstimate:
     """Keep depths that are certain, unmasked, confirmed by other views and not in small islands."""
-    counts = agreeing_views(view, estimate.depth_m, others, agreement)
+    counts = agreeing_views(view, estimate.depth_m, others, tolerance_px)
     known = (estimate.depth_m > 0) & (counts >= _MIN_VIEWS)
     known &= estimate.sigma_m <= _MAX_RELATIVE_SIGMA * estimate.depth_m
     if view.mask is not None:

@@ -25,7 +25,7 @@ from megloc_kapture.io.tables import DepthRow, write_depth_rows
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.depth import lift_with_covariances
 from megloc_kapture.mvs.views import (
-    Agreement,
+    TOLERANCE_PX,
     agreeing_views,
     choose_sources,
     confirmed,
@@ -106,12 +106,13 @@ class StereoFit:
     ----------
     max_size_px : longer side of the depth maps.
     num_sources : number of map images that an image is compared with.
+    tolerance_px : see :func:`~megloc_kapture.mvs.views.agreeing_views`.
     error_px : median error of the poses in pixels of the depth maps; 0 if unknown.
     """
 
     max_size_px: int
     num_sources: int
-    agreement: Agreement
+    tolerance_px: float
     error_px: float
 
 
@@ -204,12 +205,11 @@ def fitted_to_poses(source: KaptureFolder, max_size_px: int) -> StereoFit:
     share = float(np.sqrt(max(error_px**2 - _KEYPOINT_ERROR_PX**2, 0.0))) / side
     size = min(max_size_px, side)
     reduced = max(64, int(min(size, _ERROR_PX / share))) if share else size
-    error_px, limits = share * reduced, Agreement()
-    wider = max(1.0, _DIFFERENCE * error_px / limits.max_error_px)
+    error_px = share * reduced
     return StereoFit(
         max_size_px=reduced if reduced < size else max_size_px,
         num_sources=min(_MAX_SOURCES, round(_NUM_SOURCES * size / reduced)),
-        agreement=Agreement(wider * limits.max_error_px, wider * limits.max_relative_error),
+        tolerance_px=max(TOLERANCE_PX, _DIFFERENCE * error_px),
         error_px=error_px,
     )
 
@@ -322,7 +322,7 @@ def _confirm(
         for other, source in zip(row.sources, sources, strict=True)
         if (path := _scratch_file(scratch, other, "depth")).is_file()
     ]
-    kept = confirmed(view, estimate, others, fit.agreement)
+    kept = confirmed(view, estimate, others, fit.tolerance_px)
     limits = row.near_m, row.far_m
     kept = with_pose_errors(view, sources, kept, limits, _DEVIATION * fit.error_px)
     records = out / "sensors" / "records_data"
@@ -332,7 +332,7 @@ def _confirm(
     write_array(side_file(out, image, "normals"), normals)
     lifted = {}
     if seen_of_type:
-        views = agreeing_views(view, kept.depth_m, others, fit.agreement)
+        views = agreeing_views(view, kept.depth_m, others, fit.tolerance_px)
         sure = np.where(views >= _ANCHOR_VIEWS, kept.depth_m, np.float32(0))
         camera = folder.read().camera_of(image)
         for local_type, seen in seen_of_type.items():

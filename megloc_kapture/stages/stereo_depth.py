@@ -31,7 +31,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.points import write_ply
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.mvs.views import (
-    Agreement,
+    TOLERANCE_PX,
     agreeing_views,
     pinhole_matrix,
     stereo_camera,
@@ -138,7 +138,11 @@ def write_points(
 
 
 def fuse_depth(
-    densified: KaptureFolder, cloud: Path, agreement: Agreement, *, work: Work = HERE
+    densified: KaptureFolder,
+    cloud: Path,
+    tolerance_px: float = TOLERANCE_PX,
+    *,
+    work: Work = HERE,
 ) -> int:
     """Write a PLY cloud with normals and deviations; return the number of points.
 
@@ -152,7 +156,7 @@ def fuse_depth(
         (image, [other for other in others if other < image and other in images])
         for image, others in images.items()
     ]
-    parts = work.map(partial(_points, densified, agreement), jobs, "cloud")
+    parts = work.map(partial(_points, densified, tolerance_px), jobs, "cloud")
     nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     columns = zip(nothing, *parts, strict=True)
     xyz, colours, normals, sigma_m = (np.concatenate(column) for column in columns)
@@ -162,13 +166,13 @@ def fuse_depth(
 
 
 def _points(
-    folder: KaptureFolder, agreement: Agreement, job: tuple[str, Sequence[str]]
+    folder: KaptureFolder, tolerance_px: float, job: tuple[str, Sequence[str]]
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return world points (N, 3), colours (N, 3), unit normals (N, 3) and deviations (N,)."""
     image, earlier = job
     view, depth = _view_with_depth(folder, image)
     others = [_view_with_depth(folder, other) for other in earlier]
-    new = (depth > 0) & (agreeing_views(view, depth, others, agreement) == 0)
+    new = (depth > 0) & (agreeing_views(view, depth, others, tolerance_px) == 0)
     rows, columns = np.nonzero(new)
     pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
     in_camera = pixels @ np.linalg.inv(pinhole_matrix(view.camera)).T * depth[new][:, None]

@@ -28,7 +28,6 @@ from megloc_kapture.mvs.sweep import (
     stereo_image,
 )
 from megloc_kapture.mvs.views import (
-    Agreement,
     agreeing_views,
     choose_sources,
     confirmed,
@@ -101,7 +100,7 @@ def test_depth_sigma_and_normals_of_two_walls(estimates: list[DepthEstimate]) ->
 def test_other_views_confirm_correct_depth(estimates: list[DepthEstimate]) -> None:
     views = [view(number) for number in range(3)]
     others = [(views[n], estimates[n].depth_m) for n in (1, 2)]
-    kept = confirmed(views[0], estimates[0], others, Agreement())
+    kept = confirmed(views[0], estimates[0], others)
     exact = truth(0)
     known = kept.depth_m > 0
     assert known.mean() > 0.8
@@ -110,7 +109,7 @@ def test_other_views_confirm_correct_depth(estimates: list[DepthEstimate]) -> No
     # a wrong surface in one view
     wrong = estimates[0].depth_m.copy()
     wrong[60:90, 60:90] *= 0.9
-    assert not agreeing_views(views[0], wrong, others, Agreement())[62:88, 62:88].any()
+    assert not agreeing_views(views[0], wrong, others)[62:88, 62:88].any()
 
 
 def test_sources_may_have_another_size(estimates: list[DepthEstimate]) -> None:

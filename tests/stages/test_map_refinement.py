@@ -37,7 +37,6 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
-from megloc_kapture.mvs.views import Agreement
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
 from megloc_kapture.stages.image_pairs import Restrictions
@@ -115,14 +114,14 @@ def test_points_of_the_map_stay_and_lifted_ones_lie_on_the_walls(
 def test_fused_points_are_fewer_than_pixels_with_depth(
     densified: KaptureFolder, tmp_path: Path
 ) -> None:
-    count = fuse_depth(densified, tmp_path / "cloud.ply", Agreement())
+    count = fuse_depth(densified, tmp_path / "cloud.ply")
     filled = sum(row.fill for row in read_depth_rows(densified.root / DEPTH_FILE)) * 200 * 150
     assert 0.2 * filled < count < 0.95 * filled  # surfaces in two images are fused
 
 
 def test_resolution_follows_the_accuracy_of_the_poses(world: Any, tmp_path: Path) -> None:
     exact = fitted_to_poses(world.map(), 400)
-    assert (exact.max_size_px, exact.num_sources, exact.agreement) == (400, 4, Agreement())
+    assert (exact.max_size_px, exact.num_sources, exact.tolerance_px) == (400, 4, 1.0)
     assert exact.error_px < 0.2
     rotated = Path(shutil.copytree(world.map().root, tmp_path / "rotated", symlinks=True))
     data, rng = world.map().read(), np.random.default_rng(0)
@@ -139,7 +138,7 @@ def test_resolution_follows_the_accuracy_of_the_poses(world: Any, tmp_path: Path
     assert fitted.max_size_px == pytest.approx(400 * 0.5 / np.sqrt(median**2 - 0.09), abs=2)
     assert fitted.error_px == pytest.approx(0.5, abs=0.01)
     assert fitted.num_sources == round(4 * 400 / fitted.max_size_px)
-    assert fitted.agreement.max_error_px == pytest.approx(2.5, abs=0.05)
+    assert fitted.tolerance_px == pytest.approx(2.5, abs=0.05)
     options = OPTIONS.model_copy(update={"mode": "depth", "max_size_px": 400})
     densify_map(folder, tmp_path / "out", options)
     out = KaptureFolder(tmp_path / "out")
@@ -206,7 +205,7 @@ def test_unsuitable_folders_are_refused(
     with pytest.raises(DataError, match="records_data: the images of the map are missing"):
         densify_map(KaptureFolder(tmp_path / "blind"), tmp_path / "b", OPTIONS)
     with pytest.raises(DataError, match="no densified map"):
-        fuse_depth(world.map(), tmp_path / "c.ply", Agreement())
+        fuse_depth(world.map(), tmp_path / "c.ply")
 
 
 def test_triangulated_points_precede_lifted_ones(densified: KaptureFolder) -> None:
