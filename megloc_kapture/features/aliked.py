@@ -30,6 +30,7 @@ from megloc_kapture.nets.score_maps import (
     select_pixels,
     soft_argmax,
     suppress_non_maxima,
+    with_norm,
 )
 from megloc_kapture.values import LocalFeatures
 
@@ -231,7 +232,7 @@ class _Conv(nn.Conv2d):
         super().__init__(inputs, outputs, 3, padding=1, bias=False)
 
     def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
-        return functional.conv2d(x, *_folded(self.weight, norm), padding=1)
+        return functional.conv2d(x, *with_norm(self.weight, norm), padding=1)
 
 
 class _DeformableConv(nn.Module):
@@ -243,13 +244,7 @@ class _DeformableConv(nn.Module):
     def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
         limit = max(x.shape[2:]) / 4
         offset = self.offset_conv(x).clamp(-limit, limit)
-        return deform_conv2d(x, offset, *_folded(self.regular_conv.weight, norm))
-
-
-def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, torch.Tensor]:
-    assert norm.running_mean is not None and norm.running_var is not None
-    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-    return weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
+        return deform_conv2d(x, offset, *with_norm(self.regular_conv.weight, norm))
 
 
 def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:

@@ -26,16 +26,18 @@ from megloc_kapture.features.network import (
     Masks,
     in_image_px,
 )
-from megloc_kapture.nets.runtime import in_fast_layout, inference, load_strictly
+from megloc_kapture.nets.runtime import batch_counters, in_fast_layout, inference, load_strictly
 from megloc_kapture.nets.score_maps import (
     conv_same,
     deform_conv2d,
+    norm_factors,
     on_no_edge,
     parabola_peak,
     pixel_table,
     read_bilinear,
     select_pixels,
     suppress_non_maxima,
+    with_norm,
 )
 from megloc_kapture.values import LocalFeatures
 
@@ -44,7 +46,6 @@ STRIDE = 4  # the descriptor map is sampled as if its cell (i, j) were centred a
 # layers that add to the score map: dilation of the neighbourhood, and weight in the sum
 _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
-_NORM_EPSILON = 1e-5
 # the score map is computed in strips of at most this many activations, to bound memory
 _VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
 _BORDER_PX = 5
@@ -168,7 +169,9 @@ class AslFeatNet(nn.Module):
             x = conv(x)
             assert conv.bn is not None
             scores += self._scores(scored, x, (height, width))
-            x = strided.normalised(conv.bn.rectified_(x))
+            scale, shift = norm_factors(conv.bn)
+            x = x.mul_(scale[:, None, None]).add_(shift[:, None, None]).relu_()
+            x = strided.normalised(x)
         x = self.conv5.normalised(x)
         for name in _DEFORMABLE:
             x = self._deformable(name, x)
@@ -180,7 +183,7 @@ class AslFeatNet(nn.Module):
         amplitude = torch.sigmoid(self.get_submodule(f"deform_param.{name}.amplitude")(x))
         if conv.bn is None:
             return deform_conv2d(x, offset, conv.weight, None, amplitude)
-        weight, bias = conv.bn.folded_into(conv.weight)
+        weight, bias = with_norm(conv.weight, conv.bn)
         return deform_conv2d(x, offset, weight, bias, amplitude).relu_()
 
     def _scores(self, name: str, features: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
@@ -192,28 +195,6 @@ class AslFeatNet(nn.Module):
         )
 
 
-class _Norm(nn.Module):
-    running_mean: torch.Tensor
-    running_var: torch.Tensor
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.register_buffer("running_mean", torch.zeros(channels))
-        self.register_buffer("running_var", torch.ones(channels))
-
-    def folded_into(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        scale, shift = self._scale_and_shift()
-        return weight * scale[:, None, None, None], shift
-
-    def rectified_(self, x: torch.Tensor) -> torch.Tensor:
-        scale, shift = self._scale_and_shift()
-        return x.mul_(scale[:, None, None]).add_(shift[:, None, None]).relu_()
-
-    def _scale_and_shift(self) -> tuple[torch.Tensor, torch.Tensor]:
-        scale = torch.rsqrt(self.running_var + _NORM_EPSILON)
-        return scale, -self.running_mean * scale
-
-
 class _Conv(nn.Module):
     """3x3 convolution without bias, with TensorFlow's SAME padding and optional batch norm."""
 
@@ -223,14 +204,14 @@ class _Conv(nn.Module):
         super().__init__()
         self.stride = stride
         self.weight = nn.Parameter(torch.zeros(outputs, inputs, 3, 3))
-        self.bn = _Norm(outputs) if normalised else None
+        self.bn = nn.BatchNorm2d(outputs, affine=False) if normalised else None
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return conv_same(x, self.weight, None, self.stride)
 
     def normalised(self, x: torch.Tensor) -> torch.Tensor:
         assert self.bn is not None
-        return conv_same(x, *self.bn.folded_into(self.weight), self.stride).relu_()
+        return conv_same(x, *with_norm(self.weight, self.bn), self.stride).relu_()
 
 
 def _deformation(channels: int) -> nn.ModuleDict:
@@ -240,7 +221,8 @@ def _deformation(channels: int) -> nn.ModuleDict:
 
 def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
     """Build the network from a converted checkpoint, in eval mode."""
-    return load_strictly(AslFeatNet(), tensors, where).eval()
+    net = AslFeatNet()
+    return load_strictly(net, tensors, where, may_lack=batch_counters(net)).eval()
 
 
 def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> torch.Tensor:

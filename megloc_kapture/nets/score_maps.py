@@ -15,6 +15,7 @@ than ``grid_sample``.
 from __future__ import annotations
 
 import torch
+from torch import nn
 from torch.nn import functional
 
 CELL_PX = 8
@@ -199,6 +200,22 @@ def pixel_table(values: torch.Tensor) -> torch.Tensor:
     """Reshape (C, H, W) to (H W, C), in float32 or float64; channels-last memory is not copied."""
     exact = values.to(torch.promote_types(values.dtype, torch.float32))
     return exact.permute(1, 2, 0).reshape(-1, len(values))
+
+
+def norm_factors(norm: nn.BatchNorm2d) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return scale and shift (C,) of a trained batch normalisation."""
+    assert norm.running_mean is not None and norm.running_var is not None
+    scale = torch.rsqrt(norm.running_var + norm.eps)
+    if not norm.affine:
+        return scale, -norm.running_mean * scale
+    scale = norm.weight * scale
+    return scale, norm.bias - norm.running_mean * scale
+
+
+def with_norm(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, torch.Tensor]:
+    """Fold a batch normalisation into the convolution before it; return weight and bias."""
+    scale, shift = norm_factors(norm)
+    return weight * scale[:, None, None, None], shift
 
 
 def conv_same(
