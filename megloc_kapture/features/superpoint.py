@@ -57,7 +57,7 @@ class SuperPointOptions(LocalNetworkOptions):
     remove_borders: int = Field(
         default=4, ge=0, description="width of the border without keypoints, pixels"
     )
-    descriptor_sampling: Literal["official", "exact"] = Field(
+    descriptor_sampling: DescriptorSampling = Field(
         default="official",
         description="official: as the authors of the weights do (Magic Leap's sampling is up to "
         "3.5 px off, and SuperGlue was trained with it); exact: at the keypoint",
@@ -224,17 +224,11 @@ def superpoint_with_descriptor(
     """
     head = {key: value for key, value in descriptor.items() if not key.startswith("convP")}
     frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}
-    describes = SuperPointNet(detector=False)
-    detects = SuperPointNet(descriptor=False)
-    load_strictly(detects, frozen, detector_where)
+    detects = load_strictly(SuperPointNet(descriptor=False), frozen, detector_where)
     if any(key.startswith(("conv1", "conv2", "conv3", "conv4")) for key in head):
-        load_strictly(describes, head, descriptor_where)
+        describes = load_strictly(SuperPointNet(detector=False), head, descriptor_where)
         return SplitSuperPoint(detects, describes)
-    shared = {key: value for key, value in frozen.items() if not key.startswith("convP")}
-    load_strictly(describes, {**shared, **head}, descriptor_where)
-    whole = SuperPointNet()
-    load_strictly(whole, {**frozen, **head}, descriptor_where)
-    return whole
+    return load_strictly(SuperPointNet(), {**frozen, **head}, descriptor_where)
 
 
 def sample_descriptors(
