@@ -64,10 +64,8 @@ class LpipsDistance:
         network = _network(self.options.net, self._trunk, self._heads, device)
         with inference(device, self.options.half_precision):
             mask = torch.from_numpy(valid.astype(np.float32)).to(device)[None, None]
-            first, second = (
-                network.described(image_tensor(image, device), mask) for image in (a, b)
-            )
-            return float(network.between(first, second, mask)[0])
+            first, second = (image_tensor(image, device) for image in (a, b))
+            return float(network(first, second, mask)[0])
 
 
 @lru_cache(maxsize=2)
