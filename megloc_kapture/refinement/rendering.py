@@ -48,35 +48,14 @@ _PX_PER_POINT, _COARSE_POINTS = 24, 3200
 _CLEAR = 4.0
 
 
-def refine_by_rendering(
-    query: PosedImage, references: Sequence[PosedImage], options: RenderingOptions | None = None
-) -> PoseRefinement:
-    """Refine the pose of an image, in metres, by warping references with depth into it.
+class RenderingRefinement:
+    """Refinement of an image's pose, in metres, by warping references with depth into it.
 
-    ``measures`` of the result: cost (robust loss, 0 to 0.5), correlation and overlap before and
+    ``measures`` of the results: cost (robust loss, 0 to 0.5), correlation and overlap before and
     after; decrease of the cost in standard errors; motion in m, deg and px; numbers of points and
     references; if the pose is determined, standard deviations and the squared Mahalanobis distance.
     """
-    options = options or RenderingOptions()
-    return _Refining(query, references, options).refine()
 
-
-def judge_by_rendering(
-    query: PosedImage,
-    references: Sequence[PosedImage],
-    refined: RigidTransform,
-    options: RenderingOptions,
-    *,
-    judged: NDArray[np.bool_] | None = None,
-) -> PoseRefinement:
-    """Judge a pose from another method, after alignment at the finest level.
-
-    ``judged`` bool (H, W) are the query's pixels that acceptance uses, by default all.
-    """
-    return _Refining(query, references, options).judge(refined, judged)
-
-
-class _Refining:
     def __init__(
         self, query: PosedImage, references: Sequence[PosedImage], options: RenderingOptions
     ) -> None:
@@ -102,7 +81,13 @@ class _Refining:
             return direct if direct.accepted else searched
         return max((direct, searched), key=lambda each: each.measures.get("correlation_after", -1))
 
-    def judge(self, pose: RigidTransform, judged: NDArray[np.bool_] | None) -> PoseRefinement:
+    def judge(
+        self, pose: RigidTransform, judged: NDArray[np.bool_] | None = None
+    ) -> PoseRefinement:
+        """Judge a pose from another method, after alignment at the finest level.
+
+        ``judged`` bool (H, W) are the image's pixels that acceptance uses, by default all.
+        """
         seen, overlap = self._visibility(pose)
         if overlap < self.least_overlap:
             return _uncovered(self.start, overlap)
@@ -199,10 +184,10 @@ class Rendering:
         if not references:
             return None
         options = self.options.model_copy(update={"accept_always": False})
-        refiner = _Refining(view, references, options)
+        refiner = RenderingRefinement(view, references, options)
         refined = refiner.refine()
         if not refined.accepted:
-            refined = refiner.judge(view.cam_from_world, None)
+            refined = refiner.judge(view.cam_from_world)
         measures = refined.measures
         if "squared_distance" not in measures or (
             measures["moved_m"] > options.max_translation_m
@@ -230,4 +215,4 @@ class Rendering:
             return PoseRefinement(cam_from_world, "no reference image has depth")
         image, mask = scene.query_image(query), scene.query_mask(query)
         posed = PosedImage(image, camera, cam_from_world, mask=mask)
-        return refine_by_rendering(posed, used, self.options)
+        return RenderingRefinement(posed, used, self.options).refine()

@@ -54,7 +54,7 @@ from megloc_kapture.refinement.neural_field import (
     build_field,
     light_rows,
 )
-from megloc_kapture.refinement.rendering import judge_by_rendering
+from megloc_kapture.refinement.rendering import RenderingRefinement
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Device, Failure, ImageFeatures, Options, RigidTransform
@@ -351,7 +351,7 @@ class FieldRefiner:
         pose, light = solved, light_at(solved)
         for _ in range(_ALIGNMENTS):
             shown, _ = field.render(camera, pose, appearance=light, max_side_px=side)
-            judged = judge_by_rendering(seen, [shown], pose, options, judged=~fitted)
+            judged = RenderingRefinement(seen, [shown], options).judge(pose, ~fitted)
             if not judged.accepted:
                 break
             pose = judged.cam_from_world

@@ -18,7 +18,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.acceptance import RenderingOptions
-from megloc_kapture.refinement.rendering import Rendering, _Refining, refine_by_rendering
+from megloc_kapture.refinement.rendering import Rendering, RenderingRefinement
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()
@@ -57,7 +57,7 @@ def case() -> Case:
 def run(case: Case, start: RigidTransform, **options: object) -> PoseRefinement:
     chosen = RenderingOptions.model_validate(options)
     query = replace(case.query, cam_from_world=start)
-    return refine_by_rendering(query, case.references, chosen)
+    return RenderingRefinement(query, case.references, chosen).refine()
 
 
 def assert_accurate(refined: PoseRefinement, truth: RigidTransform, m: float, deg: float) -> None:
@@ -114,7 +114,7 @@ def test_a_wrong_search_does_not_spoil_a_good_start(
 ) -> None:
     away = displaced(case.truth, 3, m=0.1, deg=3.0)
     monkeypatch.setattr(
-        _Refining,
+        RenderingRefinement,
         "_align_from_search",
         lambda self, coarsest, start, sight: self._align(0, away, sight),
     )
@@ -152,7 +152,8 @@ def test_the_plugin_takes_the_first_references_that_have_depth(case: Case) -> No
     assert refine(["flat"]).reason == "no reference image has depth" and not scene.asked
     refined = refine(["flat", "0", "1", "2"])
     assert scene.asked == ["0", "1", "query"]
-    direct = refine_by_rendering(replace(case.query, cam_from_world=start), case.references[:2])
+    query = replace(case.query, cam_from_world=start)
+    direct = RenderingRefinement(query, case.references[:2], RenderingOptions()).refine()
     assert refined.cam_from_world == direct.cam_from_world and refined.accepted
     with pytest.raises(DataError, match="does not fit a camera"):
         run(showing(case, case.query.image[:100]), start)

@@ -21,7 +21,7 @@ from megloc_kapture.values import Camera, RigidTransform
 pytest.importorskip("torch")
 
 from megloc_kapture.refinement.acceptance import RenderingOptions  # noqa: E402
-from megloc_kapture.refinement.rendering import judge_by_rendering  # noqa: E402
+from megloc_kapture.refinement.rendering import RenderingRefinement  # noqa: E402
 from megloc_kapture.stages import neural_field  # noqa: E402
 
 IDENTITY = RigidTransform.identity()
@@ -104,12 +104,13 @@ def test_appearance_and_acceptance_use_different_halves_of_the_image(
 
     judged: list[NDArray[np.bool_]] = []
 
-    def spied(*arguments: Any, **more: Any) -> PoseRefinement:
-        judged.append(more["judged"])
-        return judge_by_rendering(*arguments, **more)
+    class SpiedRefinement(RenderingRefinement):
+        def judge(self, pose: Any, which: Any = None) -> PoseRefinement:
+            judged.append(which)
+            return super().judge(pose, which)
 
     monkeypatch.setattr(neural_field, "open_field", lambda *_: Spied())
-    monkeypatch.setattr(neural_field, "judge_by_rendering", spied)
+    monkeypatch.setattr(neural_field, "RenderingRefinement", SpiedRefinement)
     truth = room.poses(1, 4)[0]
     start = displaced(truth, 0)
     seen = room.render(truth, camera=LARGER)
@@ -123,7 +124,7 @@ def test_appearance_and_acceptance_use_different_halves_of_the_image(
     noise = np.random.default_rng(0).integers(0, 255, image.shape, np.uint8)
     query = PosedImage(np.where(half[..., None], noise, image), LARGER, start)
     by_one, by_other, by_all = (
-        judge_by_rendering(query, [reference], truth, options, judged=which)
+        RenderingRefinement(query, [reference], options).judge(truth, which)
         for which in (~half, half, None)
     )
     assert by_one.accepted and not by_other.accepted, (by_one, by_other)
