@@ -24,8 +24,8 @@ from megloc_kapture.nets.trunks import (
     RESNET_DEPTHS,
     Depth,
     ResNet,
-    Vgg16Features,
     generalized_mean,
+    vgg16_features,
 )
 
 Order = Literal["dk", "kd"]
@@ -87,7 +87,7 @@ class VggNetVlad(nn.Module):
     ) -> None:
         super().__init__()
         self.mean_rgb = mean_rgb
-        self.base_model = nn.ModuleDict({"base": Vgg16Features(last=_CONV5_3)})
+        self.base_model = nn.ModuleDict({"base": vgg16_features(last=_CONV5_3)})
         self.net_vlad = NetVladLayer(num_clusters, _CHANNELS, order=order)
         self.pca_layer = nn.Conv2d(num_clusters * _CHANNELS, output_size, 1)
 

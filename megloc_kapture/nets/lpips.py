@@ -10,7 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from megloc_kapture.nets.runtime import in_fast_layout, load_strictly
-from megloc_kapture.nets.trunks import Vgg16Features
+from megloc_kapture.nets.trunks import vgg16_features
 
 Trunk = Literal["alex", "vgg", "squeeze"]
 
@@ -57,7 +57,7 @@ _TAPS: dict[Trunk, tuple[tuple[int, int], ...]] = {
 }
 _TRUNKS: dict[Trunk, Callable[[], nn.Sequential]] = {
     "alex": alexnet_features,
-    "vgg": lambda: Vgg16Features(last=29),
+    "vgg": lambda: vgg16_features(last=29),
     "squeeze": squeezenet_features,
 }
 # input normalisation of the published module, for RGB in [-1, 1]

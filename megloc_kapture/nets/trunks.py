@@ -24,29 +24,21 @@ IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _MINIMUM = 1e-6
 
 
-class Vgg16Features(nn.Sequential):
-    """VGG-16 (configuration D) up to layer ``last``, numbered as torchvision's ``features``.
+def vgg16_features(*, last: int) -> nn.Sequential:
+    """Build VGG-16 (configuration D) up to layer ``last`` of torchvision's ``features``.
 
     Layer 28 is conv5_3 without its ReLU (512 channels, 1/16 of the image size), and layer 29 is
     that ReLU. Max pooling drops an odd last row or column.
     """
-
-    def __init__(self, *, last: int) -> None:
-        layers: list[nn.Module] = []
-        channels = 3
-        for widths in _VGG_STAGES:
-            for width in widths:
-                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
-                channels = width
-            layers.append(nn.MaxPool2d(2))
-        super().__init__(*layers[: last + 1])
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the last layer's activation (B, C, h, w) of images (B, 3, H, W)."""
-        for layer in self:
+    layers: list[nn.Module] = []
+    channels = 3
+    for widths in _VGG_STAGES:
+        for width in widths:
             # in place: feature maps of a large image take 200 MB
-            x = torch.relu_(x) if isinstance(layer, nn.ReLU) else layer(x)
-        return x
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+            channels = width
+        layers.append(nn.MaxPool2d(2))
+    return nn.Sequential(*layers[: last + 1])
 
 
 def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
