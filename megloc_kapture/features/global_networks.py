@@ -45,11 +45,7 @@ _OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX = 640, 480
 _MEGALOC_SIZE_PX = 322  # side of the input image in section 4 of the paper
 
 
-class GlobalNetworkOptions(NetworkOptions):
-    weights: str
-
-
-GlobalOptions = TypeVar("GlobalOptions", bound=GlobalNetworkOptions)
+GlobalOptions = TypeVar("GlobalOptions", bound=NetworkOptions)
 
 
 class GlobalNetwork(Checkpointed[GlobalOptions]):
@@ -84,7 +80,7 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
             return vectors
 
 
-class NetVladOptions(GlobalNetworkOptions):
+class NetVladOptions(NetworkOptions):
     weights: str = Field(
         default="netvlad-pitts30k", description="netvlad-pitts30k, netvlad-tokyotm, or a file"
     )
@@ -122,7 +118,7 @@ class NetVlad(_VggNetVladNetwork[NetVladOptions]):
     _load = staticmethod(netvlad)
 
 
-class OpenIblOptions(GlobalNetworkOptions):
+class OpenIblOptions(NetworkOptions):
     weights: str = Field(default="openibl", description="openibl, or a file")
     max_size_px: int | None = Field(
         default=None,
@@ -154,7 +150,7 @@ def _bilinear(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uin
     return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR), np.uint8)
 
 
-class ApGemOptions(GlobalNetworkOptions):
+class ApGemOptions(NetworkOptions):
     weights: str = Field(
         default="apgem-resnet101-lm18",
         description="apgem-resnet101-lm18 (Google-Landmarks), apgem-resnet101, or a file",
@@ -211,7 +207,7 @@ class ApGem(GlobalNetwork[ApGemOptions]):
         return vectors
 
 
-class DelgOptions(GlobalNetworkOptions):
+class DelgOptions(NetworkOptions):
     weights: str = Field(
         default="delg-r101-gldv2clean",
         description="delg-{r50,r101}-{gld,gldv2clean}, or a converted file",
@@ -251,7 +247,7 @@ def _with_longer_side(image: NDArray[np.uint8], max_size_px: int | None) -> NDAr
     return _bilinear(image, size)
 
 
-class MegaLocOptions(GlobalNetworkOptions):
+class MegaLocOptions(NetworkOptions):
     weights: str = Field(default="megaloc", description="name in the registry, or a file")
     size_px: int = Field(
         default=_MEGALOC_SIZE_PX,
