@@ -80,7 +80,11 @@ def _search(
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
     queries_per_block = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
     num_rankings = len(combine([np.zeros((0, 0), np.float32)] * len(database)))
-    best = [_BestRows(num_queries, min(length, num_rows)) for _ in range(num_rankings)]
+    shape = num_queries, min(length, num_rows)
+    best = [
+        (np.full(shape, -1, np.int64), np.full(shape, -np.inf, np.float32))
+        for _ in range(num_rankings)
+    ]
     for left in range(0, num_rows, step) if num_queries else ():
         right = min(left + step, num_rows)
         blocks = [np.ascontiguousarray(source[left:right], np.float32) for source in database]
@@ -90,8 +94,8 @@ def _search(
                 rows[block_queries] @ block.T for rows, block in zip(vectors, blocks, strict=True)
             ]
             for scores, ranking in zip(combine(products), best, strict=True):
-                ranking.add(first, left, scores)
-    return [(ranking.rows, ranking.scores) for ranking in best]
+                _merge(ranking, np.asarray(scores, np.float32), first, left)
+    return best
 
 
 def _checked(queries: NDArray[np.floating[Any]], source: VectorRows) -> Float32:
@@ -104,24 +108,18 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorRows) -> Float32:
     return rows
 
 
-class _BestRows:
-    """Best ``top_k`` rows so far of each query: ``rows`` int64, -1 if unset, ``scores`` float32."""
-
-    def __init__(self, num_queries: int, top_k: int) -> None:
-        self.rows = np.full((num_queries, top_k), -1, dtype=np.int64)
-        self.scores = np.full((num_queries, top_k), -np.inf, dtype=np.float32)
-
-    def add(self, first_query: int, first_row: int, scores: NDArray[np.floating[Any]]) -> None:
-        """Add scores (q, b) of queries and database rows; blocks come in the database's order."""
-        block = slice(first_query, first_query + len(scores))
-        top_k = self.rows.shape[1]
-        new_scores, columns = _first_best(np.asarray(scores, np.float32), top_k)
-        merged = np.concatenate([self.scores[block], new_scores], axis=1)
-        rows = np.concatenate([self.rows[block], first_row + columns], axis=1)
-        # previous rows come first, so that they win ties
-        order = np.argsort(-merged, axis=1, kind="stable")[:, :top_k]
-        self.scores[block] = np.take_along_axis(merged, order, axis=1)
-        self.rows[block] = np.take_along_axis(rows, order, axis=1)
+def _merge(best: Found, scores: Float32, first_query: int, first_row: int) -> None:
+    """Update the best rows so far by scores (q, b); blocks come in the database's order."""
+    block = slice(first_query, first_query + len(scores))
+    best_rows, best_scores = (array[block] for array in best)
+    top_k = best_rows.shape[1]
+    new_scores, columns = _first_best(scores, top_k)
+    merged = np.concatenate([best_scores, new_scores], axis=1)
+    rows = np.concatenate([best_rows, first_row + columns], axis=1)
+    # previous rows come first, so that they win ties
+    order = np.argsort(-merged, axis=1, kind="stable")[:, :top_k]
+    best_scores[:] = np.take_along_axis(merged, order, axis=1)
+    best_rows[:] = np.take_along_axis(rows, order, axis=1)
 
 
 def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]]:
