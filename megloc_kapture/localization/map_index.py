@@ -154,9 +154,6 @@ def resolve_conflicts(
     are from depth (``seen_once``); then matches are sorted by the number of map images that give
     them (``image_rows``), by similarity and by ids.
     """
-    if len(keypoint_ids) == 0:
-        none = np.zeros(0, dtype=np.int64)
-        return Correspondences(none, none, none, none)
     order = np.argsort(_paired(keypoint_ids, point_ids))
     keypoints, points = keypoint_ids[order], point_ids[order]
     # distinct pairs, sorted by keypoint, then point
