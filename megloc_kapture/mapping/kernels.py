@@ -20,14 +20,10 @@ _MIN_RATIO = 1e-13
 
 def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None:
     """Call ``work(first, last)`` for independent parts of ``range(count)``, in threads."""
-    chunks = [(first, min(first + size, count)) for first in range(0, count, size)]
-    if len(chunks) < 2:
-        for first, last in chunks:
-            work(first, last)
-        return
+    starts = range(0, count, size)
     with ThreadPoolExecutor(get_num_threads()) as executor:  # one per available core
-        for done in [executor.submit(work, first, last) for first, last in chunks]:
-            done.result()
+        for _ in executor.map(work, starts, [min(first + size, count) for first in starts]):
+            pass
 
 
 @compiled_loop
