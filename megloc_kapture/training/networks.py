@@ -288,8 +288,9 @@ def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
     As in SuperGlue's evaluation, the sign of the translation is ignored. Without a baseline, only
     the rotation counts. If no pose is estimated, the error is infinite.
     """
-    views, truth = pair.pair.views, pair.pair.b_from_a
-    assert views is not None and truth is not None
+    views = pair.pair.views
+    assert views is not None
+    truth = views[1].cam_from_world @ views[0].cam_from_world.inverse()
     rays = [
         bearing_rays(view.camera, features.keypoints_px[matches[:, side], :2])
         for side, (view, features) in enumerate(zip(views, pair.features, strict=True))

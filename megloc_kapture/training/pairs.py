@@ -33,7 +33,6 @@ from megloc_kapture.training.labels import (
     labels_of_views,
     overlap,
 )
-from megloc_kapture.values import RigidTransform
 
 # candidate pairs, before their overlap is measured
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
@@ -57,14 +56,6 @@ class TrainingPair:
     label: Labelling  # returns the labels of keypoints (N, 2) and (M, 2) of the images
     # None if a homography relates the images
     views: tuple[PosedView, PosedView] | None = None
-
-    @property
-    def b_from_a(self) -> RigidTransform | None:
-        """Return the relative pose of posed images."""
-        if self.views is None:
-            return None
-        a, b = self.views
-        return b.cam_from_world @ a.cam_from_world.inverse()
 
 
 class PosedPairs:
