@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import Images
+from megloc_kapture.geometry.cameras import reduced_size
 from megloc_kapture.nets.delg import delg_from, describe
 from megloc_kapture.nets.global_descriptors import (
     STRIDE_PX,
@@ -230,21 +231,14 @@ class Delg(GlobalNetwork[DelgOptions]):
     _load = staticmethod(delg_from)
 
     def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-        sized = np.array(_with_longer_side(image, self.options.max_size_px))
+        height, width = image.shape[:2]
+        size = reduced_size(width, height, self.options.max_size_px)
+        sized = np.array(image if size == (width, height) else _bilinear(image, size))
         return torch.from_numpy(sized).to(device)[None].permute(0, 3, 1, 2).float()
 
     def _vectors(self, network: Any, batch: torch.Tensor) -> torch.Tensor:
         with inference(batch.device, self.options.half_precision):
             return describe(network, batch, self.options.scales)
-
-
-def _with_longer_side(image: NDArray[np.uint8], max_size_px: int | None) -> NDArray[np.uint8]:
-    height, width = image.shape[:2]
-    if max_size_px is None or max(height, width) <= max_size_px:
-        return image
-    scale = max_size_px / max(height, width)
-    size = max(round(width * scale), 1), max(round(height * scale), 1)
-    return _bilinear(image, size)
 
 
 class MegaLocOptions(NetworkOptions):

@@ -95,6 +95,15 @@ def scaled_camera(camera: Camera, scale: float) -> Camera:
     return replace(camera, width=width, height=height, params=tuple(params))
 
 
+def reduced_size(width: int, height: int, max_size_px: int | None) -> tuple[int, int]:
+    """Return a size with a longer side of at most ``max_size_px``, in whole pixels, at least 1."""
+    longer = max(width, height)
+    if max_size_px is None or longer <= max_size_px:
+        return width, height
+    scale = max_size_px / longer
+    return max(round(width * scale), 1), max(round(height * scale), 1)
+
+
 def reduced_camera(camera: Camera, max_side_px: int) -> Camera:
     """Scale a camera down to a longer side of at most ``max_side_px``."""
     longer = max(camera.width, camera.height)

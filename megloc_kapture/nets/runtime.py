@@ -19,6 +19,7 @@ from pydantic import Field
 from torch import nn
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.geometry.cameras import reduced_size
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.values import Device, Options
 
@@ -115,10 +116,9 @@ def sized_tensor(
     are rounded half to even, and are at least 1.
     """
     height, width = image.shape[:2]
-    if max_size_px is None or max(height, width) <= max_size_px:
+    size = reduced_size(width, height, max_size_px)
+    if size == (width, height):
         return image_tensor(image, device)
-    scale = max_size_px / max(height, width)
-    size = max(round(width * scale), 1), max(round(height * scale), 1)
     resized = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(np.asarray(resized)).to(device).permute(2, 0, 1)[None] / 255.0
 

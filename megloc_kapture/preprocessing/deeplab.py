@@ -19,6 +19,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import reduced_size
 from megloc_kapture.nets.runtime import (
     Checkpointed,
     NetworkOptions,
@@ -76,9 +77,8 @@ class DeepLab(Checkpointed[DeepLabOptions]):
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return labels uint8 (H, W), indices into ``classes``, of an RGB image uint8 (H, W, 3)."""
         height, width = image.shape[:2]
-        scale = self.options.max_size_px / max(height, width)
-        if scale < 1:
-            size = (max(round(width * scale), 1), max(round(height * scale), 1))
+        size = reduced_size(width, height, self.options.max_size_px)
+        if size != (width, height):
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         network, device = self.network(_deeplab)
         with inference(device, self.options.half_precision):

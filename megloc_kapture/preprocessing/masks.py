@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from megloc_kapture.geometry.cameras import reduced_size
 from megloc_kapture.values import Options
 
 # polygons are tested in blocks of rows, to bound memory
@@ -144,8 +145,7 @@ def edge_directions(image: NDArray[np.uint8]) -> Float32:
     import cv2
 
     height, width = image.shape[:2]
-    scale = min(1.0, _WORKING_SIZE_PX / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
+    size = reduced_size(width, height, _WORKING_SIZE_PX)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     # the kernel returns 8 times the slope

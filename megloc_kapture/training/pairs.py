@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import reduced_size
 from megloc_kapture.io.images import is_image, read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
@@ -165,12 +166,6 @@ class Photographs:
 
 
 PairSource = PosedPairs | Photographs
-
-
-def reduced_size(width: int, height: int, max_size_px: int) -> tuple[int, int]:
-    """Return the size, reduced to a longer side of at most ``max_size_px``."""
-    scale = min(1.0, max_size_px / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _size(view: PosedView) -> tuple[int, int]:
