@@ -137,36 +137,37 @@ class AlikedNet(nn.Module):
         maps = []
         for k in range(len(images)):
             levels = [level[k : k + 1] for level in coarse]
-            fine = _level(level1[k : k + 1])
+            fine = _channels_last(level1[k])
             # half precision would make neighbouring scores equal, and equal maxima are all kept
             with torch.autocast(images.device.type, enabled=False):
                 scores = torch.sigmoid(self._score_logits(fine, levels)[0, 0])
             scores = scores[top : top + height, left : left + width]
-            maps.append(AlikedMaps(self, scores, (top, left), fine, [_level(x) for x in levels]))
+            coarse_last = [_channels_last(level[0]) for level in levels]
+            maps.append(AlikedMaps(self, scores, (top, left), fine, coarse_last))
         return maps
 
-    def _score_logits(self, fine: _Level, coarse: list[torch.Tensor]) -> torch.Tensor:
+    def _score_logits(self, fine: torch.Tensor, coarse: list[torch.Tensor]) -> torch.Tensor:
         first, *others = (
             weight[:, :, 0, 0].T
             for weight in self.get_parameter("score_head.0.weight").chunk(4, dim=1)
         )
+        height, width = fine.shape[:2]
         sums: torch.Tensor | None = None
         for level, weight in zip(coarse, others, strict=True):
             reduced = (level.float().permute(0, 2, 3, 1) @ weight).permute(0, 3, 1, 2)
             enlarged = functional.interpolate(
-                reduced, fine.size, mode="bilinear", align_corners=True
+                reduced, (height, width), mode="bilinear", align_corners=True
             )
             sums = enlarged if sums is None else sums.add_(enlarged)
         assert sums is not None
-        by_pixel = sums.permute(0, 2, 3, 1).reshape(len(fine.table), -1)
+        by_pixel = sums.permute(0, 2, 3, 1).reshape(height * width, -1)
         # on a CPU, a strip stays in the cache; on a GPU, strips would only add kernel launches
-        rows = _STRIP_ROWS if by_pixel.device.type == "cpu" else fine.size[0]
-        at_once = rows * fine.size[1]
+        at_once = (_STRIP_ROWS if by_pixel.device.type == "cpu" else height) * width
         for strip, into in zip(
-            torch.split(fine.table, at_once), torch.split(by_pixel, at_once), strict=True
+            torch.split(fine.flatten(0, 1), at_once), torch.split(by_pixel, at_once), strict=True
         ):
             into += self.fine_tap(strip.float()) @ first
-        return self.score_head[1:](by_pixel.view(1, *fine.size, -1).permute(0, 3, 1, 2))
+        return self.score_head[1:](by_pixel.view(1, height, width, -1).permute(0, 3, 1, 2))
 
     def fine_tap(self, level1: torch.Tensor) -> torch.Tensor:
         """Return the finest level's features (N, D / 4) for activations (N, C) of ``block1``."""
@@ -174,37 +175,31 @@ class AlikedNet(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class _Level:
-    table: torch.Tensor
-    size: tuple[int, int]
-
-
-@dataclass(frozen=True, eq=False)
 class AlikedMaps:
-    """Score map of an image, float32 (H, W) in (0, 1), and feature levels to sample at pixels."""
+    """Score map of an image, float32 (H, W) in (0, 1), and feature levels (h, w, C) to sample."""
 
     _net: AlikedNet
     scores: torch.Tensor
     _origin: tuple[int, int]  # row and column of the image's first pixel in the padded image
-    _fine: _Level
-    _coarse: list[_Level]
+    _fine: torch.Tensor
+    _coarse: list[torch.Tensor]
 
     def features_at(self, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
         """Return unit-norm features (N, D) of pixels, given as int64 (N,) rows and columns."""
         row, column = rows + self._origin[0], columns + self._origin[1]
-        height, width = self._fine.size
-        parts = [self._net.fine_tap(self._fine.table[row * width + column])]
+        height, width = self._fine.shape[:2]
+        parts = [self._net.fine_tap(self._fine[row, column])]
         for level in self._coarse:
-            h, w = level.size
+            h, w = level.shape[:2]
             # align_corners: the corner pixels of both maps coincide
-            y = row.to(level.table.dtype) * ((h - 1) / (height - 1))
-            x = column.to(level.table.dtype) * ((w - 1) / (width - 1))
-            parts.append(read_bilinear(level.table, y.clamp(max=h - 1), x.clamp(max=w - 1), (h, w)))
+            y = (row.to(level.dtype) * ((h - 1) / (height - 1))).clamp(max=h - 1)
+            x = (column.to(level.dtype) * ((w - 1) / (width - 1))).clamp(max=w - 1)
+            parts.append(read_bilinear(level.flatten(0, 1), y, x, (h, w)))
         return functional.normalize(torch.cat(parts, dim=1), dim=1)
 
 
-def _level(features: torch.Tensor) -> _Level:
-    return _Level(pixel_table(features[0]), (features.shape[2], features.shape[3]))
+def _channels_last(features: torch.Tensor) -> torch.Tensor:
+    return pixel_table(features).view(*features.shape[1:], -1)
 
 
 class _Block(nn.Module):
