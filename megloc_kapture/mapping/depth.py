@@ -34,7 +34,7 @@ _PIXELS_OF_SIGMA = 3.0
 MAX_DEPTH_JUMP = 0.1
 # noise of triangulated points, from keypoints and map poses: with the sensor's noise alone, half
 # the points would be rejected (docs/experiments/map-refinement.md)
-_KEYPOINT_NOISE_PX = 2.0
+KEYPOINT_NOISE_PX = 2.0
 # a point may match any depth within this many pixels: allows for edges and for misregistration of
 # image and depth
 _WINDOW_PX = 3
@@ -177,40 +177,19 @@ class DepthVerificationOptions(Options):
         return noise
 
 
-def contradicted_by_depth(
-    points_in_image: Floats,
-    depth_m: NDArray[np.float32],
-    depth_camera: Camera,
-    image_from_depth: RigidTransform,
-    options: DepthVerificationOptions,
-    *,
-    deviations: Floats | None = None,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Find the points (N, 3), in the image camera's frame, that are off the surface of a depth map.
-
-    ``deviations`` (N,) are the points' standard deviations along the depth camera's axis for a
-    keypoint noise of 1 px, NaN if unknown. Returns masks (N,): points off the surface, and points
-    that have depth to compare with.
-    """
-    sigmas = 0.0 if deviations is None else np.nan_to_num(deviations) * _KEYPOINT_NOISE_PX
-    before, behind, checked = compare_with_depth(
-        points_in_image, depth_m, depth_camera, image_from_depth, options, sigmas
-    )
-    return before | behind, checked
-
-
 def compare_with_depth(
     points_in_image: Floats,
     depth_m: NDArray[np.float32],
     depth_camera: Camera,
     image_from_depth: RigidTransform,
     options: DepthVerificationOptions,
-    sigmas: Floats | float,
+    sigmas: Floats | float = 0.0,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
     """Compare points (N, 3), in the image camera's frame, with the surface of a depth map.
 
-    ``sigmas`` are the points' standard deviations along the depth camera's axis. Returns masks
-    (N,): points in front of the surface, behind it, and points that have depth to compare with.
+    ``sigmas`` are the points' standard deviations along the depth camera's axis; NaN, for unknown,
+    counts as 0. Returns masks (N,): points in front of the surface, behind it, and points that have
+    depth to compare with.
     """
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
     before, behind, checked = np.zeros((3, len(points)), bool)
@@ -231,9 +210,9 @@ def compare_with_depth(
     whole = known.all(axis=1)
     rows, window = rows[whole], window[whole]
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)
-    keypoint_sigmas = np.broadcast_to(sigmas, len(points))[rows]
+    point_sigmas = np.nan_to_num(np.broadcast_to(sigmas, len(points))[rows])
     below, above = (
-        options.max_sigmas * np.hypot(depth_noise(depth, options.noise), keypoint_sigmas)
+        options.max_sigmas * np.hypot(depth_noise(depth, options.noise), point_sigmas)
         for depth in (low, high)
     )
     checked[rows] = True

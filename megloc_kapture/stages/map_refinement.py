@@ -32,9 +32,9 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.mapping.depth import (
+    KEYPOINT_NOISE_PX,
     DepthVerificationOptions,
     compare_with_depth,
-    contradicted_by_depth,
 )
 from megloc_kapture.mapping.uncertainty import (
     ObservedPoints,
@@ -281,7 +281,7 @@ def _verify_depth(
         pose = observed.cams_from_world[image]
         axis = (depth.image_from_depth.inverse() @ pose).rotation_matrix()[2]
         variances = _quadratic_form(covariances[points], axis)
-        return depth, pose.apply(observed.xyz[points]), np.sqrt(variances)
+        return depth, pose.apply(observed.xyz[points]), KEYPOINT_NOISE_PX * np.sqrt(variances)
 
     dropped = np.zeros(len(selection.kept), dtype=bool)
     num_checked = 0
@@ -392,7 +392,7 @@ def _judge(
     return through & ~agreeing, agreeing
 
 
-# depth, points (N, 3) in the image's frame, deviations (N,) along the depth axis
+# depth, points (N, 3) in the image's frame, their standard deviations (N,) along the depth axis
 _DepthJob = tuple[DepthRecord, Floats, Floats]
 
 
@@ -406,16 +406,11 @@ def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
 def _compare(
     folder: KaptureFolder, options: DepthVerificationOptions, job: _DepthJob
 ) -> tuple[Mask, int]:
-    depth, points, deviations = job
-    contradicted, checked = contradicted_by_depth(
-        points,
-        read_depth(folder, depth),
-        depth.camera,
-        depth.image_from_depth,
-        options,
-        deviations=deviations,
+    depth, points, sigmas = job
+    before, behind, checked = compare_with_depth(
+        points, read_depth(folder, depth), depth.camera, depth.image_from_depth, options, sigmas
     )
-    return contradicted, int(checked.sum())
+    return before | behind, int(checked.sum())
 
 
 def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from pydantic import ValidationError
 from megloc_kapture.geometry.cameras import depth_noise
 from megloc_kapture.mapping import depth as module
 from megloc_kapture.mapping.depth import (
+    KEYPOINT_NOISE_PX,
     DepthVerificationOptions,
-    contradicted_by_depth,
+    compare_with_depth,
     lift_keypoints,
     lift_with_covariances,
 )
@@ -29,6 +31,14 @@ OFFSET = rigid([0.0, 0.0, 0.02], [0.04, 0.01, 0.0])
 SMALL = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 ASIDE = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
 EXACT = DepthVerificationOptions(max_sigmas=3.0, noise=(0.01, 0.0, 0.0))
+
+
+def contradicted_by_depth(
+    *arguments: Any, **settings: Any
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return masks of the points off the surface, and of those with depth."""
+    before, behind, checked = compare_with_depth(*arguments, **settings)
+    return before | behind, checked
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -178,9 +188,8 @@ def test_an_uncertain_point_may_be_farther_off() -> None:
     # 0.5 off: 3 sigmas of hypot(0.01, 2 * deviation)
     least = np.sqrt((0.5 / 3) ** 2 - 0.01**2) / 2.0
     deviations = np.array([0.0, np.nan, 0.999 * least, 1.001 * least])
-    contradicted, _ = contradicted_by_depth(
-        points, depth, SMALL, IDENTITY, EXACT, deviations=deviations
-    )
+    sigmas = KEYPOINT_NOISE_PX * deviations
+    contradicted, _ = contradicted_by_depth(points, depth, SMALL, IDENTITY, EXACT, sigmas)
     assert contradicted.tolist() == [True, True, True, False]
 
 
