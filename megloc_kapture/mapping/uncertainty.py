@@ -81,13 +81,9 @@ def _by_point(
     if (point_ids[1:] < point_ids[:-1]).any():
         order = np.argsort(point_ids, kind="stable")
         point_ids, image_ids = point_ids[order], image_ids[order]
-    return _starts(point_ids, num_points), np.ascontiguousarray(image_ids, dtype=np.int32)
-
-
-def _starts(ids: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    starts = np.zeros(count + 1, dtype=np.int64)
-    np.cumsum(np.bincount(ids, minlength=count), out=starts[1:])
-    return starts
+    starts = np.zeros(num_points + 1, dtype=np.int64)
+    np.cumsum(np.bincount(point_ids, minlength=num_points), out=starts[1:])
+    return starts, np.ascontiguousarray(image_ids, dtype=np.int32)
 
 
 class UncertaintyOptions(Options):
@@ -115,10 +111,6 @@ class ObservedPoints:
     image_ids: NDArray[np.int32]
     cameras: Sequence[Camera]
     cams_from_world: Sequence[RigidTransform]
-
-    def starts(self) -> NDArray[np.int64]:
-        """Return the first observation of each point and the end; int64 (N + 1,)."""
-        return _starts(self.point_ids, len(self.xyz))
 
     def by_image(self) -> Iterator[tuple[int, NDArray[np.int64]]]:
         """Yield each observing image with its rows of observations, ascending."""
