@@ -17,8 +17,9 @@ _VECTOR_ELEMENTS = 1 << 25  # elements of a block of database rows, per feature:
 _MOST_ROWS = 1 << 14  # largest number of rows in a block, even if vectors are short
 _GROUP = 8  # scores of which only the largest is used to find a bound of the best
 Float32 = NDArray[np.float32]
-Matrices = Sequence[NDArray[np.floating[Any]]]
-Found = tuple[NDArray[np.int64], Float32]
+Similarities = NDArray[np.floating[Any]]
+Matrices = Sequence[Similarities]
+Ranking = tuple[NDArray[np.int64], Float32]
 
 
 class VectorRows(Protocol):
@@ -46,7 +47,7 @@ def rank_rows(
     top_k: int,
     fusion: FusionOptions,
     weights: Sequence[float] | None = None,
-) -> Found:
+) -> Ranking:
     """Rank the rows of a database by one or several global features.
 
     ``queries`` and ``database`` are (Q, D_i) and (M, D_i) per feature. Returns indices int64
@@ -72,7 +73,7 @@ def _search(
     database: Sequence[VectorRows],
     length: int,
     combine: Callable[[Matrices], Matrices],
-) -> list[Found]:
+) -> list[Ranking]:
     """Rank at most ``length`` rows by each matrix of scores that ``combine`` returns."""
     vectors = [_checked(rows, source) for rows, source in zip(queries, database, strict=True)]
     num_queries, num_rows = len(vectors[0]), common_length(database)
@@ -108,7 +109,7 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorRows) -> Float32:
     return rows
 
 
-def _merge(best: Found, scores: Float32, first_query: int, first_row: int) -> None:
+def _merge(best: Ranking, scores: Float32, first_query: int, first_row: int) -> None:
     """Update the best rows so far by scores (q, b); blocks come in the database's order."""
     block = slice(first_query, first_query + len(scores))
     best_rows, best_scores = (array[block] for array in best)
@@ -145,8 +146,6 @@ FusionMethod = Literal["ghm", "mean", "early", "reciprocal_rank"]
 _GAMMA = 0.5  # kapture-localization's default
 _RANK_CONSTANT = 60  # the value of Cormack et al.
 _RANKED_IMAGES = 200  # smallest length of the ranking per feature in reciprocal rank fusion
-Similarities = NDArray[np.floating[Any]]
-Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
 class FusionOptions(Options):
@@ -160,7 +159,7 @@ class FusionOptions(Options):
 
 
 def fuse(
-    similarities: Sequence[Similarities],
+    similarities: Matrices,
     options: FusionOptions,
     weights: Sequence[float] | None = None,
 ) -> Similarities:

@@ -29,8 +29,8 @@ from megloc_kapture.mapping.pairs import (
     pairs_by_sequence,
 )
 from megloc_kapture.retrieval.search import (
-    Found,
     FusionOptions,
+    Ranking,
     VectorRows,
     common_length,
     rank_rows,
@@ -137,7 +137,7 @@ class Retrieval:
         queries: Sequence[VectorRows],
         database: Sequence[VectorRows],
         top_k: int,
-    ) -> Found:
+    ) -> Ranking:
         """Return indices and scores, (Q, at most ``top_k``), of the most similar database rows.
 
         ``queries`` and ``database`` have the unit vectors of each type as rows; they are read in
@@ -171,7 +171,7 @@ def most_similar(
     permitted: NDArray[np.int64],
     retrieval: Retrieval,
     top_k: int,
-) -> Found:
+) -> Ranking:
     """Return the most similar images of each query, best first, and their scores, both (Q, K).
 
     Parameters

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval import search
-from megloc_kapture.retrieval.search import Found, FusionOptions, fuse, rank_rows
+from megloc_kapture.retrieval.search import FusionOptions, Ranking, fuse, rank_rows
 
 
-def rank_by_similarity(queries: Any, database: Any, top_k: int) -> Found:
+def rank_by_similarity(queries: Any, database: Any, top_k: int) -> Ranking:
     return rank_rows([queries], [database], top_k, FusionOptions())
 
 
