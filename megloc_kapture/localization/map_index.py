@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -96,19 +97,13 @@ class MapIndex:
 
         The diagonal has the number of points of each image.
         """
-        count, seen_by = len(images), [self.observed(image)[1] for image in images]
-        rows = np.repeat(np.arange(count), [len(points) for points in seen_by])
-        keys = np.unique(_paired(np.concatenate([self.point_ids[:0], *seen_by]), rows))
-        points, rows = keys >> 32, keys & 0xFFFFFFFF
-        shared = np.diag(np.bincount(rows, minlength=count))
-        for step in range(1, count):
-            same = points[step:] == points[:-step]
-            if not same.any():
-                break
-            pairs = rows[:-step][same] * count + rows[step:][same]
-            each = np.bincount(pairs, minlength=count**2).reshape(count, count)
-            shared = shared + each + each.T
-        return shared
+        seen_by = [np.unique(self.observed(image)[1]) for image in images]
+        rows = np.repeat(np.arange(len(images)), [len(points) for points in seen_by])
+        points = np.concatenate([self.point_ids[:0], *seen_by])
+        sees = csr_array(
+            (np.ones(len(rows), np.int64), (rows, points)), shape=(len(images), len(self.xyz))
+        )
+        return np.asarray((sees @ sees.T).toarray())
 
 
 def _paired(high: Integers, low: Integers) -> NDArray[np.int64]:
