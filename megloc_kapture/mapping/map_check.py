@@ -8,9 +8,8 @@ principal points at exactly ((w - 1) / 2, (h - 1) / 2) indicate the centre.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -207,8 +206,8 @@ def _median_errors_px(images: Iterable[ObservedKeypoints], xyz: Floats) -> Float
 def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[str, float]:
     """Return the interpretation of the map with the smallest error, and its median error."""
     best = ("", np.inf)
-    for name, read in _readings(images, xyz):
-        error = float(np.median(_median_errors_px(map(read, images), xyz)))
+    for name, read_images in _readings(images, xyz):
+        error = float(np.median(_median_errors_px(read_images, xyz)))
         # of interpretations with similar errors take the first, which is the simplest
         if error < 0.9 * best[1]:
             best = (name, error)
@@ -217,33 +216,25 @@ def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[s
 
 def _readings(
     images: Sequence[ObservedKeypoints], xyz: Floats
-) -> Iterator[tuple[str, Callable[[ObservedKeypoints], ObservedKeypoints]]]:
-    """Yield other interpretations of a map."""
+) -> Iterator[tuple[str, list[ObservedKeypoints]]]:
+    """Yield the images in other interpretations of the map."""
     yield (
         "keypoints read as (y, x)",
-        lambda image: replace(image, keypoints_px=image.keypoints_px[:, ::-1]),
+        [replace(image, keypoints_px=image.keypoints_px[:, ::-1]) for image in images],
     )
     for name, convention in CONVENTIONS.items():
-        yield name, partial(_with_convention, convention)
+        yield name, [replace(i, cam_from_world=convention(i.cam_from_world)) for i in images]
     factors = _factors(images, xyz)
     if (scale := factors.get("keypoints")) is not None:
         yield (
             f"keypoints multiplied by {scale:.3g}",
-            lambda image: replace(
-                image, keypoints_px=image.keypoints_px.astype(np.float64) * scale
-            ),
+            [replace(i, keypoints_px=i.keypoints_px.astype(np.float64) * scale) for i in images],
         )
     if (longer := factors.get("focal")) is not None:
         yield (
             f"a focal length {longer:.3g} times as long",
-            lambda image: replace(image, camera=scale_focal(image.camera, longer)),
+            [replace(image, camera=scale_focal(image.camera, longer)) for image in images],
         )
-
-
-def _with_convention(
-    convention: Callable[[RigidTransform], RigidTransform], image: ObservedKeypoints
-) -> ObservedKeypoints:
-    return replace(image, cam_from_world=convention(image.cam_from_world))
 
 
 def _factors(images: Sequence[ObservedKeypoints], xyz: Floats) -> dict[str, float]:
