@@ -302,13 +302,13 @@ def soft_assignment(
     descriptors: NDArray[np.floating[Any]], centres: NDArray[np.floating[Any]], alpha: float
 ) -> NDArray[np.float64]:
     """Return ``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
+    from scipy.special import softmax
+
     data = np.asarray(descriptors, dtype=np.float64)
     centres = np.asarray(centres, dtype=np.float64)
     # |x|^2 is omitted because it cancels within a row
     logits = alpha * (2.0 * data @ centres.T - np.einsum("kd,kd->k", centres, centres))
-    logits -= logits.max(axis=1, keepdims=True)
-    weights = np.exp(logits)
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+    return np.asarray(softmax(logits, axis=1))
 
 
 def _unit(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
