@@ -18,10 +18,10 @@ from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
     ArrayKind,
+    Blobs,
     FeatureConfig,
     FeatureReader,
     FeatureWriter,
-    TarBlobs,
     feature_folder,
     list_types,
     read_config,
@@ -206,7 +206,7 @@ def test_a_compressed_tar_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "keypoints.tar"
     path.write_bytes(b"\x1f\x8b\x08packed")
     with pytest.raises(DataError, match=r"keypoints\.tar: not an uncompressed tar"):
-        TarBlobs(path, ".kpt")
+        Blobs(tmp_path, "keypoints")
 
 
 def test_a_depth_map_in_millimetres_is_named(tmp_path: Path) -> None:

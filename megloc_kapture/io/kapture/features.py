@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,14 +134,30 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
 # ------------------------------------------------------------------------------------ files
 
 
-class FolderBlobs:
-    """Feature arrays (blobs) as files below ``folder`` with the given suffix."""
+class Blobs:
+    """Feature arrays (blobs) of a type's folder: loose files, or members of its tar; thread-safe.
 
-    def __init__(self, folder: Path, suffix: str) -> None:
-        self._folder, self._suffix = folder, suffix
+    The tar is uncompressed, kapture's form for many files.
+    """
+
+    def __init__(self, folder: Path, kind: FeatureKind) -> None:
+        self._folder, self._suffix = folder, SUFFIX[kind]
+        self._tar = folder / f"{kind}.tar"
+        self._members: dict[str, tuple[int, int]] = {}  # offset and size in the tar
+        if not self._tar.is_file() or self._tar.stat().st_size == 0:
+            return  # kapture creates a tar as an empty file
+        with (
+            reading(self._tar, "an uncompressed tar"),
+            named(self._tar),
+            tarfile.open(self._tar, "r:") as tar,
+        ):
+            for member in tar:
+                if member.isreg() and member.name.endswith(self._suffix):
+                    name = check_relative(member.name.removeprefix("./"))
+                    self._members[name] = (member.offset_data, member.size)
 
     def names(self) -> list[str]:
-        names = []
+        names = list(self._members)
         for folder, _, files in os.walk(self._folder):
             below = folder[len(str(self._folder)) :].lstrip("/")
             prefix = f"{below}/" if below else ""
@@ -150,67 +166,33 @@ class FolderBlobs:
 
     def __contains__(self, name: str) -> bool:
         try:
-            return os.path.isfile(f"{self._folder}/{check_relative(name)}")
+            return name in self._members or os.path.isfile(self._file(name))
         except DataError:
             return False
 
     def size(self, name: str) -> int:
-        path = safe_join(self._folder, name)
-        with reading(path):
-            return path.stat().st_size
+        if name in self._members:
+            return self._members[name][1]
+        with reading(self._file(name)):
+            return os.stat(self._file(name)).st_size
 
     def read(self, name: str) -> bytes:
-        path = f"{self._folder}/{check_relative(name)}"  # creating a Path is much slower
-        with reading(path), open(path, "rb", buffering=0) as file:
-            return file.readall()
-
-    def where(self, name: str) -> str:
-        return str(self._folder / name)
-
-
-class TarBlobs:
-    """Feature arrays in an uncompressed tar, kapture's form for many files; thread-safe."""
-
-    def __init__(self, path: Path, suffix: str) -> None:
-        self._path = path
-        self._index: dict[str, tuple[int, int]] = {}
-        if path.stat().st_size == 0:
-            return  # kapture creates a tar as an empty file
-        with reading(path, "an uncompressed tar"), named(path), tarfile.open(path, "r:") as tar:
-            for member in tar:
-                if member.isreg() and member.name.endswith(suffix):
-                    name = check_relative(member.name.removeprefix("./"))
-                    self._index[name] = (member.offset_data, member.size)
-
-    def names(self) -> list[str]:
-        return sorted(self._index)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._index
-
-    def size(self, name: str) -> int:
-        return self._index[name][1]
-
-    def read(self, name: str) -> bytes:
-        offset, size = self._index[name]
-        with reading(self._path), open(self._path, "rb", buffering=0) as file:
+        if name not in self._members:
+            path = self._file(name)
+            with reading(path), open(path, "rb", buffering=0) as file:
+                return file.readall()
+        offset, size = self._members[name]
+        with reading(self._tar), open(self._tar, "rb", buffering=0) as file:
             content = os.pread(file.fileno(), size, offset)
         if len(content) < size:
-            raise DataError(f"truncated at member {name!r}", path=self._path)
+            raise DataError(f"truncated at member {name!r}", path=self._tar)
         return content
 
     def where(self, name: str) -> str:
-        return f"{self._path}[{name}]"
+        return f"{self._tar}[{name}]" if name in self._members else str(self._folder / name)
 
-
-BlobSource: TypeAlias = FolderBlobs | TarBlobs
-
-
-def blob_sources(folder: Path, kind: FeatureKind) -> list[BlobSource]:
-    """Return the tar of a type's folder, if any, and its loose files."""
-    files = FolderBlobs(folder, SUFFIX[kind])
-    tar = folder / f"{kind}.tar"
-    return [TarBlobs(tar, SUFFIX[kind]), files] if tar.is_file() else [files]
+    def _file(self, name: str) -> str:
+        return f"{self._folder}/{check_relative(name)}"  # creating a Path is much slower
 
 
 # --------------------------------------------------------------------------------- reading
@@ -224,7 +206,7 @@ class FeatureReader:
 
     def __init__(self, kind: ArrayKind, type_name: str, folders: Sequence[Path]) -> None:
         self.kind, self.type_name = kind, type_name
-        self._sources = [source for folder in folders for source in blob_sources(folder, kind)]
+        self._sources = [Blobs(folder, kind) for folder in folders]
         paths = [folder / f"{kind}.txt" for folder in folders]
         self.config, *others = [read_config(path, kind) for path in paths]
         for path, config in zip(paths[1:], others, strict=True):
@@ -268,7 +250,7 @@ class FeatureReader:
         source, name = self._source(image)
         return source.where(name)
 
-    def _num_rows(self, size: int, source: BlobSource, name: str) -> int:
+    def _num_rows(self, size: int, source: Blobs, name: str) -> int:
         rows, rest = divmod(size, self.config.dsize * self.config.dtype.itemsize)
         if rest or (self.kind == "global_features" and rows != 1):
             expected = "exactly one row" if self.kind == "global_features" else "whole rows"
@@ -279,7 +261,7 @@ class FeatureReader:
             )
         return rows
 
-    def _source(self, image: str) -> tuple[BlobSource, str]:
+    def _source(self, image: str) -> tuple[Blobs, str]:
         name = image + SUFFIX[self.kind]
         for source in self._sources:
             if name in source:

@@ -17,12 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, safe_join, write_bytes, writing
-from megloc_kapture.io.kapture.features import (
-    SUFFIX,
-    BlobSource,
-    blob_sources,
-    feature_folder,
-)
+from megloc_kapture.io.kapture.features import SUFFIX, Blobs, feature_folder
 from megloc_kapture.io.kapture.format import check_columns, check_field, format_table, read_rows
 from megloc_kapture.io.text_lines import numbers_of
 
@@ -37,7 +32,7 @@ class MatchesReader:
 
     def __init__(self, type_name: str, folders: Sequence[Path]) -> None:
         self.type_name = type_name
-        self._sources = [s for folder in folders for s in blob_sources(folder, "matches")]
+        self._sources = [Blobs(folder, "matches") for folder in folders]
 
     @cached_property
     def pairs(self) -> list[tuple[str, str]]:
@@ -84,7 +79,7 @@ class MatchesReader:
             columns = columns[:, ::-1]
         return columns.astype(np.int64), rows[:, 2].copy()
 
-    def _find(self, a: str, b: str) -> tuple[BlobSource, str, bool] | None:
+    def _find(self, a: str, b: str) -> tuple[Blobs, str, bool] | None:
         for source in self._sources:
             for left, right in (sorted((a, b)), sorted((a, b), reverse=True)):
                 if (name := _name(left, right)) in source:

@@ -13,10 +13,10 @@ from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
     ArrayKind,
+    Blobs,
     FeatureConfig,
     FeatureReader,
     FeatureWriter,
-    TarBlobs,
     feature_folder,
     list_types,
 )
@@ -96,13 +96,16 @@ def test_members_of_a_tar_of_the_current_folder_are_read_by_name(tmp_path: Path)
     for name, content in contents.items():
         (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "in" / name).write_bytes(content)
-    with tarfile.open(tmp_path / "x.tar", "w") as file:
-        file.add(tmp_path / "in", ".")
-    blobs = pickle.loads(pickle.dumps(TarBlobs(tmp_path / "x.tar", ".kpt")))
+    folder = tmp_path / "T"
+    folder.mkdir()
+    for kind in ("keypoints", "descriptors"):
+        with tarfile.open(folder / f"{kind}.tar", "w") as file:
+            file.add(tmp_path / "in", ".")
+    blobs = pickle.loads(pickle.dumps(Blobs(folder, "keypoints")))
     assert blobs.names() == sorted(contents)
     assert {name: blobs.read(name) for name in contents} == contents
     assert blobs.size("a.kpt") == 1000 and "a" not in blobs
-    assert TarBlobs(tmp_path / "x.tar", ".desc").names() == []
+    assert Blobs(folder, "descriptors").names() == []
 
 
 # -------------------------------------------------------------------------------------- matches
