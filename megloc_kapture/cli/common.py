@@ -18,7 +18,7 @@ import tyro
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.io.text_lines import CameraList, read_cameras
+from megloc_kapture.io.text_lines import read_cameras
 from megloc_kapture.pipeline.executors import (
     LOG_FORMAT,
     ExecutorKind,
@@ -136,7 +136,7 @@ def camera_of_text(text: str) -> Camera:
         ) from error
 
 
-def cameras_of_text(text: str | None) -> Camera | CameraList | None:
+def cameras_of_text(text: str | None) -> Camera | dict[str, Camera] | None:
     """Parse a camera as :func:`camera_of_text` does, or read a camera list file."""
     if text is None:
         return None

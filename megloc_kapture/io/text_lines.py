@@ -10,7 +10,7 @@ import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -93,37 +93,27 @@ _ROW = re.compile(
 )
 
 
-class CameraList:
-    """Cameras by the names of their images.
+def find_camera(cameras: Mapping[str, Camera], image: str, path: Path) -> Camera | None:
+    """Return the camera of an image by its name and path from a list; None if no row fits.
 
-    An image gets the row whose name is the longest suffix of the image's path, in whole path
-    components. Without such a row, it gets the only row whose name ends with the image's name.
+    The row's name is the longest suffix of the path, in whole path components. Without such a row,
+    the only row whose name ends with the image's name is taken.
     """
-
-    def __init__(self, cameras: Mapping[str, Camera]) -> None:
-        self._cameras = cameras
-        self._by_file: dict[str, list[str]] = {}
-        for name in cameras:
-            self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
-
-    def of(self, image: str, path: Path) -> Camera | None:
-        """Return the camera of an image by its name and path; None if not exactly one row fits."""
-        names = self._by_file.get(PurePosixPath(image).name, [])
-        file = path.absolute().as_posix()
-        ending = [name for name in names if file.endswith(f"/{name}")]
-        if not ending:
-            ending = [name for name in names if name.endswith(f"/{image}")]
-            if len(ending) > 1:
-                return None
-        return self._cameras[max(ending, key=len)] if ending else None
+    parts = path.absolute().as_posix().split("/")
+    suffixes = ("/".join(parts[start:]) for start in range(1, len(parts)))
+    name = next((suffix for suffix in suffixes if suffix in cameras), None)
+    if name is None:
+        alike = [listed for listed in cameras if listed.endswith(f"/{image}")]
+        name = alike[0] if len(alike) == 1 else None
+    return None if name is None else cameras[name]
 
 
-def read_cameras(path: Path) -> Camera | CameraList:
+def read_cameras(path: Path) -> Camera | dict[str, Camera]:
     """Read a list; a single row with a number as its name (COLMAP's id) applies to all images."""
     cameras = read_camera_rows(path)
     if len(cameras) == 1 and next(iter(cameras)).isdigit():
         return next(iter(cameras.values()))
-    return CameraList(cameras)
+    return cameras
 
 
 def read_camera_rows(path: Path) -> dict[str, Camera]:

@@ -6,7 +6,7 @@ import logging
 import os
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -44,7 +44,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
-from megloc_kapture.io.text_lines import CameraList
+from megloc_kapture.io.text_lines import find_camera
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import Query, Unit
@@ -327,7 +327,7 @@ class Photographs(Queries):
     def __init__(
         self,
         paths: Sequence[Path | str],
-        camera: Camera | CameraList | None = None,
+        camera: Camera | Mapping[str, Camera] | None = None,
         *,
         every: int | None = None,
     ) -> None:
@@ -335,7 +335,7 @@ class Photographs(Queries):
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be used; give 1 or more")
         check_option(paths, "no photographs are given; name image files or folders")
-        if not isinstance(camera, CameraList | None):
+        if not isinstance(camera, Mapping | None):
             check_camera(camera)
         check_option(
             all(isinstance(path, str | Path) for path in paths),
@@ -416,11 +416,16 @@ class Photographs(Queries):
                 write_image(place, turned_upright(pixels, image.orientation))
 
     def _add(
-        self, name: str, path: Path, given: Camera | CameraList | None, *, is_frame: bool = False
+        self,
+        name: str,
+        path: Path,
+        given: Camera | Mapping[str, Camera] | None,
+        *,
+        is_frame: bool = False,
     ) -> None:
         camera = given if isinstance(given, Camera) else self._calibrated.get(name)
-        if isinstance(given, CameraList):
-            camera = given.of(name, path)
+        if isinstance(given, Mapping):
+            camera = find_camera(given, name, path)
         if camera is None:
             photo = read_photo(path)
             self._images[name] = _Image(
@@ -437,7 +442,7 @@ class Photographs(Queries):
         self._images[name] = _Image(path, camera, 1, "", is_frame)
 
     def _add_video(
-        self, name: str, path: Path, camera: Camera | CameraList | None, every: int
+        self, name: str, path: Path, camera: Camera | Mapping[str, Camera] | None, every: int
     ) -> None:
         if self._frames is None:
             self._frames = tempfile.TemporaryDirectory(prefix=TEMPORARY)
