@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.pose_files import parse_pose, parse_timestamp
-from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
+from megloc_kapture.evaluation.protocols import PROTOCOLS, benchmark_of
 from megloc_kapture.evaluation.report.content import counted
 from megloc_kapture.geometry.poses import (
     READINGS,
@@ -24,7 +24,7 @@ from megloc_kapture.geometry.poses import (
     rotation_matrices,
     stack_poses,
 )
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, PoseFileFormat, Protocol
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, PoseFileFormat, Protocol, SideTables
 from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
@@ -116,7 +116,7 @@ class CheckReport:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Reference(Benchmark):
+class Reference(SideTables):
     """Imported dataset and the rules of its benchmark.
 
     ``expected`` maps names in the pose file to scored queries; ``map_poses`` are ``cam_from_world``

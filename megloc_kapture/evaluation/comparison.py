@@ -20,11 +20,12 @@ from megloc_kapture.evaluation.metrics import (
     pose_errors,
     recall_row,
     row_members,
+    thresholds_from_pairs,
     within,
 )
-from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_result, recall_rows
+from megloc_kapture.io.dataset_tables import SideTables
 
 SIGNIFICANCE = 0.05
 NUM_RESAMPLES, _CHUNK = 2000, 250
@@ -236,7 +237,7 @@ class WithoutTruth(Reported):
 
 def evaluate_without_truth(
     results: Sequence[Result],
-    benchmark: Benchmark = Benchmark(),  # noqa: B008
+    benchmark: SideTables = SideTables(),  # noqa: B008
     *,
     queries: Collection[str] | None = None,
     thresholds: Sequence[Threshold] | None = None,
@@ -253,7 +254,7 @@ def evaluate_without_truth(
     require(images, "no query: the results name no image")
     conditions = benchmark.conditions(images)
     members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
-    thresholds = tuple(thresholds or benchmark.thresholds())
+    thresholds = tuple(thresholds or thresholds_from_pairs(benchmark.protocol.thresholds))
     agreement, apart = list[AgreementRow](), []
     for i, j in combinations(range(len(results)), 2):
         first, second = results[i].poses, results[j].poses

@@ -15,7 +15,7 @@ from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.comparison import WithoutTruth, evaluate_without_truth
 from megloc_kapture.evaluation.metrics import Threshold, pose_errors
 from megloc_kapture.evaluation.pose_files import poses_by_image
-from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
+from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.results import (
     Poses,
     Result,
@@ -38,6 +38,7 @@ from megloc_kapture.geometry.poses import (
 )
 from megloc_kapture.io.dataset_tables import (
     METRES,
+    SideTables,
     SimilarityTransform,
     World,
     read_nowhere,
@@ -113,7 +114,7 @@ def evaluate(
 
 def benchmark_beside(
     beside: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
-) -> Benchmark:
+) -> SideTables:
     """Return the benchmark of ``side_tables``, or of the first path that is in a workspace."""
     for path in beside:
         if isinstance(path, Path | str):
@@ -124,7 +125,7 @@ def benchmark_beside(
 def evaluate_results(
     results: Sequence[Localized],
     truth: Path | str | Poses,
-    benchmark: Benchmark,
+    benchmark: SideTables,
     *,
     thresholds: Sequence[Threshold] | None = None,
     mapping: Path | str | None = None,
@@ -174,7 +175,7 @@ def evaluate_results(
 
 def results_without_truth(
     results: Sequence[Localized],
-    benchmark: Benchmark,
+    benchmark: SideTables,
     *,
     thresholds: Sequence[Threshold] | None = None,
     mapping: Path | str | None = None,
@@ -206,7 +207,7 @@ def results_without_truth(
 
 def _read(
     results: Sequence[Localized],
-    benchmark: Benchmark,
+    benchmark: SideTables,
     contexts: Sequence[ResultContext],
     labels: Sequence[str] | None,
     images: Collection[str],

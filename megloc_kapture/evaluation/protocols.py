@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from pathlib import Path
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.metrics import Threshold, thresholds_from_pairs
-from megloc_kapture.io.dataset_tables import ImageGroup, Protocol, SideTables, read_side_tables
+from megloc_kapture.io.dataset_tables import Protocol, SideTables, read_side_tables
 
 TWIN_PREFIX = "synthetic-"
 
@@ -73,36 +71,11 @@ def protocol_of(name: str) -> Protocol:
     raise OptionError(f"unknown dataset {name!r}; known: {', '.join(PROTOCOLS)}")
 
 
-_DEFAULT_GROUP = ImageGroup()
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Benchmark(SideTables):
-    """The rules of a benchmark."""
-
-    def thresholds(self) -> tuple[Threshold, ...]:
-        return thresholds_from_pairs(self.protocol.thresholds)
-
-    def scored(self, images: Iterable[str]) -> set[str]:
-        return {i for i in images if self.groups.get(i, _DEFAULT_GROUP).scored}
-
-    def conditions(self, images: Iterable[str]) -> dict[str, str]:
-        """Return image -> condition, from the groups of the side tables.
-
-        Without groups, a folder named like a condition defines it (``query/night/x.jpg``).
-        """
-        if self.groups:
-            return {i: self.groups[i].condition for i in images if i in self.groups}
-        known = set(self.protocol.conditions)
-        folders = {i: [f for f in PurePosixPath(i).parts[:-1] if f in known] for i in images}
-        return {image: names[0] for image, names in folders.items() if len(names) == 1}
-
-
-def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = None) -> Benchmark:
+def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = None) -> SideTables:
     """Return the benchmark of a workspace's ``megloc/`` folder, of a dataset, or the default.
 
     A dataset overrides the protocol of the workspace, but not its groups, frame, names and pairs.
     """
     named = None if dataset is None else protocol_of(dataset)
     tables = SideTables() if side_tables is None else read_side_tables(Path(side_tables))
-    return Benchmark(**vars(tables) | {"protocol": named or tables.protocol})
+    return replace(tables, protocol=named or tables.protocol)

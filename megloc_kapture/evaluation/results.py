@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
-from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.io import tables
 from megloc_kapture.io.colmap_model import read_colmap_model
 from megloc_kapture.io.dataset_tables import (
@@ -22,6 +21,7 @@ from megloc_kapture.io.dataset_tables import (
     PROTOCOL_FILE,
     SIDE_TABLES,
     RelocalizationPair,
+    SideTables,
     World,
     read_groups,
     read_world,
@@ -168,7 +168,7 @@ class Result:
 
 def read_result(
     source: Path | str,
-    benchmark: Benchmark,
+    benchmark: SideTables,
     *,
     images: Iterable[str] = (),
     references: Poses | None = None,

@@ -26,11 +26,11 @@ from megloc_kapture.evaluation.metrics import (
     pose_errors,
     recall_row,
     row_members,
+    thresholds_from_pairs,
 )
-from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.results import Poses, Result, ResultContext
 from megloc_kapture.geometry.poses import compose, invert, stack_poses
-from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair
+from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair, SideTables
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.refinement.acceptance import squared_distance
 from megloc_kapture.values import LocalizationResult, RigidTransform
@@ -216,7 +216,7 @@ def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
 def evaluate_poses(
     result: Result,
     truth: Poses,
-    benchmark: Benchmark = Benchmark(),  # noqa: B008
+    benchmark: SideTables = SideTables(),  # noqa: B008
     *,
     thresholds: Sequence[Threshold] | None = None,
     nowhere: Collection[str] = (),
@@ -235,7 +235,7 @@ def evaluate_poses(
         counted,
         "no query with a true pose counts in this benchmark: is this the right ground truth?",
     )
-    thresholds = tuple(thresholds or benchmark.thresholds())
+    thresholds = tuple(thresholds or thresholds_from_pairs(benchmark.protocol.thresholds))
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
     queries = tuple(
@@ -325,7 +325,7 @@ def query_result(
 def evaluate_pairs(
     result: Result,
     truth: Poses,
-    benchmark: Benchmark,
+    benchmark: SideTables,
     references: Poses,
     *,
     thresholds: Sequence[Threshold] | None = None,
@@ -357,11 +357,11 @@ def evaluate_pairs(
             },
         ),
         {n: truth[p.query] for n, p in named.items() if p.query in truth},
-        Benchmark(
+        SideTables(
             protocol=benchmark.protocol.model_copy(update={"conditions": conditions, "pools": {}}),
             groups={n: ImageGroup(condition=called[p.file]) for n, p in named.items()},
         ),
-        thresholds=thresholds or benchmark.thresholds(),
+        thresholds=thresholds,
     )
     names = by_center.errors.names
     has_pose = by_center.errors.has_pose

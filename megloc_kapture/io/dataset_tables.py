@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
 import numpy as np
@@ -190,7 +190,9 @@ def _unreadable(image: ImageName, reason: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideTables:
-    """The tables that describe a dataset; an empty table has no file.
+    """The tables that describe a dataset, and the rules of its evaluation.
+
+    An empty table has no file.
 
     ``world`` transforms between the local frame, that of the map and the true poses, and the
     official frame of pose files. ``names`` is the challenge's list, image -> name in a pose file;
@@ -203,6 +205,21 @@ class SideTables:
     names: Mapping[str, str] = field(default_factory=dict)
     relocalization: Sequence[RelocalizationPair] = ()
     world: World = World()
+
+    def scored(self, images: Iterable[str]) -> set[str]:
+        """Return the images that count in recall and belong into the pose file."""
+        return {i for i in images if i not in self.groups or self.groups[i].scored}
+
+    def conditions(self, images: Iterable[str]) -> dict[str, str]:
+        """Return image -> condition, from the groups.
+
+        Without groups, a folder named like a condition defines it (``query/night/x.jpg``).
+        """
+        if self.groups:
+            return {i: self.groups[i].condition for i in images if i in self.groups}
+        known = set(self.protocol.conditions)
+        folders = {i: [f for f in PurePosixPath(i).parts[:-1] if f in known] for i in images}
+        return {image: names[0] for image, names in folders.items() if len(names) == 1}
 
 
 def read_side_tables(folder: Path) -> SideTables:

@@ -11,10 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation import scoring
-from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.io.dataset_tables import ImageGroup, Protocol
+from megloc_kapture.io.dataset_tables import ImageGroup, Protocol, SideTables
 from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 from tests.worlds import one_camera
@@ -120,5 +119,5 @@ def evaluate_poses(
         for image in {*estimated, *truth, *nowhere}
     }
     result = Result(label, estimated, tuple(sorted(estimated)), **options)
-    benchmark = Benchmark(protocol=Protocol(), groups=groups)
+    benchmark = SideTables(protocol=Protocol(), groups=groups)
     return scoring.evaluate_poses(result, truth, benchmark, thresholds=thresholds, nowhere=nowhere)

@@ -17,7 +17,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import format_pose_file
-from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
+from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
 from megloc_kapture.evaluation.results import (
     context_of,
     distinct_labels,
@@ -28,6 +28,7 @@ from megloc_kapture.evaluation.results import (
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
+    SideTables,
     SimilarityTransform,
     World,
     write_groups,
@@ -66,15 +67,15 @@ def test_labels_of_results_are_distinct(paths: list[str], labels: list[str]) -> 
 
 
 def test_conditions_from_folder_names() -> None:
-    rules = Benchmark(protocol=protocol_of("robotcar"))
+    rules = SideTables(protocol=protocol_of("robotcar"))
     images = ["night-rain/rear/1.jpg", "dawn/left/2.jpg", "left/3.jpg", "dawn/night/4.jpg"]
     assert rules.conditions(images) == {
         "night-rain/rear/1.jpg": "night-rain",
         "dawn/left/2.jpg": "dawn",
     }
     # a file named like a condition does not count, and tables overrule folders
-    assert Benchmark(protocol=protocol_of("aachen")).conditions(["query/night"]) == {}
-    grouped = Benchmark(
+    assert SideTables(protocol=protocol_of("aachen")).conditions(["query/night"]) == {}
+    grouped = SideTables(
         protocol=protocol_of("aachen"), groups={"query/night/1.jpg": ImageGroup(condition="dusk")}
     )
     assert grouped.conditions(["query/night/1.jpg", "query/day/2.jpg"]) == {
@@ -106,7 +107,7 @@ def test_results_in_other_local_frames(world: Any, tmp_path: Path) -> None:
     for other in others:
         np.testing.assert_allclose(other, first, rtol=0, atol=1e-9)
     # the guard: in its own frame it is metres off
-    wrong = evaluate_results([write_kapture(tmp_path / "lone", names, moved)], truth, Benchmark())
+    wrong = evaluate_results([write_kapture(tmp_path / "lone", names, moved)], truth, SideTables())
     assert np.median(wrong[0].errors.position_m) > 1.0
 
 
@@ -175,7 +176,7 @@ def test_statuses_and_side_tables_are_used(
 ) -> None:
     alone = evaluate(result, truth)
     assert [row.name for row in alone.rows] == ["all"] and len(alone.thresholds) == 4
-    actual = read_result(result, Benchmark())
+    actual = read_result(result, SideTables())
     assert actual.images == tuple(sorted(world.truth))
     assert len(actual.poses) == 36 and actual.statuses == world.statuses
     unscored = sorted(world.truth)[0]

@@ -14,12 +14,13 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate_results
 from megloc_kapture.evaluation.metrics import thresholds_from_pairs
 from megloc_kapture.evaluation.pose_files import format_mlad_file, relative_pose
-from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
+from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import plain, report_data, report_text
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import evaluate_pairs
 from megloc_kapture.io.dataset_tables import (
     RelocalizationPair,
+    SideTables,
     write_protocol,
     write_relocalization,
 )
@@ -124,7 +125,7 @@ def evaluate_all(
 ) -> Any:
     result = Result("", estimated, tuple(estimated))
     return evaluate_pairs(
-        result, truth, Benchmark(relocalization=tuple(pairs)), references, thresholds=THRESHOLDS
+        result, truth, SideTables(relocalization=tuple(pairs)), references, thresholds=THRESHOLDS
     )
 
 
@@ -160,7 +161,7 @@ def test_mlad_pairs_and_conditions() -> None:
     actual = evaluate_pairs(
         Result("", estimated, tuple(estimated), statuses),
         truth,
-        Benchmark(relocalization=tuple(pairs)),
+        SideTables(relocalization=tuple(pairs)),
         references,
         thresholds=THRESHOLDS,
     )

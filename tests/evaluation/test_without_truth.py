@@ -19,12 +19,13 @@ from megloc_kapture.evaluation.comparison import (
 )
 from megloc_kapture.evaluation.evaluate import results_without_truth
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
+from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import render_report, report_text
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
+    SideTables,
     write_groups,
     write_names,
     write_protocol,
@@ -73,7 +74,7 @@ def second() -> Result:
 @pytest.fixture
 def result(first: Result, second: Result) -> WithoutTruth:
     groups = {image: ImageGroup(condition=name) for image, name in CONDITIONS.items()}
-    benchmark = Benchmark(protocol=Protocol(truth="Nobody tells."), groups=groups)
+    benchmark = SideTables(protocol=Protocol(truth="Nobody tells."), groups=groups)
     return evaluate_without_truth([first, second], benchmark, thresholds=THRESHOLDS)
 
 
@@ -131,15 +132,15 @@ def test_pose_files_may_spell_the_same_queries_differently(tmp_path: Path) -> No
     first.write_text(f"d/1.jpg{row}d/2.jpg{row}")
     second.write_text(f"1.png{row}/data/d/2.jpg{row}")
     other.write_text(f"9.jpg{row}")
-    result = results_without_truth([first, second], Benchmark())
+    result = results_without_truth([first, second], SideTables())
     assert result.agreement[0].num_both == result.agreement[0].num_queries == 2
     with pytest.raises(
         DataError, match=r"no query in common: first.* 'd/1\.jpg', other.* '9\.jpg'"
     ):
-        results_without_truth([first, other], Benchmark())
+        results_without_truth([first, other], SideTables())
     first.write_text(f"d/9.jpg{row}n/9.jpg{row}")
     with pytest.raises(DataError, match=r"other\.txt: '9\.jpg' may be"):
-        results_without_truth([first, other], Benchmark())
+        results_without_truth([first, other], SideTables())
 
 
 def test_from_a_workspace(first: Result, tmp_path: Path) -> None:
@@ -159,6 +160,6 @@ def test_from_a_workspace(first: Result, tmp_path: Path) -> None:
     assert [row.num_queries for row in result.evaluations[0].rows] == [2, 2, 4]
     # without a list, all queries of the workspace do that are scored
     everything = results_without_truth(
-        [workspace / "localized"], Benchmark(protocol=rules.protocol, groups=rules.groups)
+        [workspace / "localized"], SideTables(protocol=rules.protocol, groups=rules.groups)
     )
     assert everything.evaluations[0].rows[-1].num_queries == 5
