@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
-from megloc_kapture.datasets.official import Count, Missing
+from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.pose_files import RelativePoses
 from megloc_kapture.io.files import named
@@ -91,11 +91,6 @@ def read_poses(path: Path) -> dict[int, RigidTransform]:
     return _by_timestamp(path, _transform)
 
 
-def timestamp_of_name(stem: str) -> int | None:
-    """Return the time (ns) that is the stem of a file name; None for other stems."""
-    return int(stem) if _TIMESTAMP.fullmatch(stem) else None
-
-
 def _by_timestamp(path: Path, parse: Callable[[list[str]], Row]) -> dict[int, Row]:
     rows: dict[int, Row] = {}
     with reading_lines(path, comments=True) as lines:
@@ -159,7 +154,7 @@ _IMAGES = "undistorted_images"
 _MARKS = (_IMAGES, GNSS_POSES, POSES, "times.txt")
 _RELOCALIZATION_FOLDERS = (".", "RelocalizationFiles*", "*", "*/RelocalizationFiles*")
 # number of pairs by (source, target), from the challenges' pages
-_PUBLISHED_PAIRS = {
+PUBLISHED_PAIRS = {
     ("recording_2020-10-08_09-57-28", "recording_2021-01-07_14-03-57"): 227,
     ("recording_2020-10-08_11-53-41", "recording_2021-05-10_19-51-14"): 227,
     ("recording_2021-02-25_13-25-15", "recording_2021-05-10_18-26-26"): 129,
@@ -188,17 +183,13 @@ class Recording:
     def times_on_disk(self, camera: str) -> list[int]:
         """Return the timestamps (ns) of a camera's images, sorted."""
         images = (self.folder / _IMAGES / camera).glob("*.png")
-        times = (timestamp_of_name(path.stem) for path in images)
-        return sorted(time for time in times if time is not None)
+        return sorted(int(path.stem) for path in images if _TIMESTAMP.fullmatch(path.stem))
 
     def calibration(self, root: Path) -> StereoCalibration:
-        return read_calibration(self.calibration_folder(root))
-
-    def calibration_folder(self, root: Path) -> Path:
         for folder in (self.folder, root):
             for name in CALIBRATION_FOLDERS:
                 if (folder / name).is_dir():
-                    return folder / name
+                    return read_calibration(folder / name)
         raise DataError(
             f"no folder {' or '.join(CALIBRATION_FOLDERS)} here or in {self.name}; it is a "
             "separate download (calibration.zip)",
@@ -217,10 +208,6 @@ class RelocalizationFile:
     @cached_property
     def rows(self) -> RelativePoses:
         return read_relocalization(self.path)
-
-    def count(self) -> Count:
-        published = _PUBLISHED_PAIRS.get((self.source, self.target))
-        return Count(f"pairs in {self.path.name}", len(self.rows), published)
 
 
 def find_recordings(root: Path) -> dict[str, Recording]:

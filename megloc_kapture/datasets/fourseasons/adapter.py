@@ -11,7 +11,7 @@ scale of the pose's row or, if the row lacks it, of Transformations.txt.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from megloc_kapture.datasets.fourseasons import (
     CAMERAS,
     GNSS_POSES,
     POSES,
+    PUBLISHED_PAIRS,
     TRANSFORMATIONS,
     Recording,
     RelocalizationFile,
@@ -52,6 +53,7 @@ from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Options, RigidTransform
 
 NAME = "4seasons"
+RIG = "car"
 # thresholds of other long-term benchmarks, used without relocalization files
 _GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
@@ -103,50 +105,55 @@ class FourSeasons:
         self.options = options or FourSeasonsOptions()
 
     def check(self, root: Path) -> None:
-        chosen = self._select(root, Missing(root))
+        chosen = select(root, self.options.reference, self.options.queries, Missing(root))
         for recording in (*chosen.references, *chosen.queries):
             recording.calibration(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         missing = Missing(root)
-        suffixes: dict[StereoCalibration, str] = {}
-        chosen = self._select(root, missing)
+        chosen = select(root, self.options.reference, self.options.queries, missing)
+        used = (*chosen.references, *chosen.queries)
         poses = self._reference_poses(chosen.references, missing)
         frame = LocalFrame.around(poses[chosen.references[0].name])
         local = {name: frame.cams_from_local(keyframes) for name, keyframes in poses.items()}
-        mapping = ImageRecords(suffixes, missing, self.options.stereo)
+        calibrations = {recording.name: recording.calibration(root) for recording in used}
+        cars = _car_ids(calibrations)
+        mapping, query = KaptureData(), KaptureData()
         for recording in chosen.references:
-            self._add_map(mapping, recording, root, local[recording.name])
-        query = ImageRecords(suffixes, missing, self.options.stereo)
+            name, known = recording.name, local[recording.name]
+            times: Iterable[int] = sorted(known)
+            if self.options.frames == "all":
+                times = recording.times_on_disk(CAMERAS[0])
+            self._add_images(mapping, recording, calibrations[name], cars[name], times, missing)
+            taken = {timestamp for timestamp, _ in mapping.records_camera}
+            mapping.trajectories |= {(t, cars[name]): known[t] for t in known if t in taken}
         truth: dict[tuple[int, str], RigidTransform] = {}
-        cars: dict[str, str] = {}
         for recording in chosen.queries:
+            name = recording.name
             published = self._poses(recording, missing) if frame.earth_from_scene else None
             known = {} if published is None else frame.cams_from_local(published)
             times = self._query_times(recording, known, chosen.files, missing)
-            calibration = recording.calibration(root)
-            cars[recording.name] = query.add(recording, calibration, times)
-            truth |= {(time, cars[recording.name]): pose for time, pose in known.items()}
+            self._add_images(query, recording, calibrations[name], cars[name], times, missing)
+            truth |= {(time, cars[name]): pose for time, pose in known.items()}
         pairs, priors, true_poses = challenge_tables(
-            chosen.files, chosen.recordings, local, mapping.data, query.data
+            chosen.files, chosen.recordings, local, mapping, query
         )
         truth |= {(time, cars[name]): pose for (name, time), pose in true_poses.items()}
         lost = sum(len(file.rows) for file in chosen.files) - len(pairs)
-        groups = _image_groups(chosen, mapping.data, query.data)
-        truth_folder, truth_groups = read_ground_truth(root, query.data, frame.world())
+        groups = _image_groups(chosen, mapping, query)
+        truth_folder, truth_groups = read_ground_truth(root, query, frame.world())
         for image in groups.keys() & truth_groups.keys():
             condition = truth_groups[image].condition or groups[image].condition
             groups[image] = groups[image].model_copy(update={"condition": condition})
-        query_gt = _known_poses(query.data, truth, truth_folder)
-        used = (*chosen.references, *chosen.queries)
+        query_gt = _known_poses(query, truth, truth_folder)
         rules: dict[str, Any] = {
             "conditions": tuple(recording.name for recording in chosen.queries)
         }
         if not chosen.files:  # no challenge: write absolute poses in ECEF
             rules |= {"thresholds": _GENERAL_THRESHOLDS, "pose_file": "ltvl"}
         return OfficialDataset(
-            mapping=mapping.data,
-            query=query.data,
+            mapping=mapping,
+            query=query,
             query_gt=query_gt,
             links={recording.name: recording.folder for recording in used},
             protocol=protocol_of(NAME).model_copy(update=rules),
@@ -154,13 +161,10 @@ class FourSeasons:
             priors=priors,
             relocalization=pairs,
             world=frame.world(),
-            summary=_summary(chosen, poses, mapping.data, query.data, query_gt),
+            summary=_summary(chosen, poses, mapping, query, query_gt),
             remarks=_remarks(poses, frame, lost, self.options.min_fusion_quality),
             missing=missing,
         )
-
-    def _select(self, root: Path, missing: Missing) -> Selection:
-        return select(root, self.options.reference, self.options.queries, missing)
 
     def _poses(
         self, recording: Recording, missing: Missing, *, on_earth: bool = True
@@ -186,22 +190,30 @@ class FourSeasons:
             poses_of[recording.name] = keyframes
         return poses_of
 
-    def _add_map(
+    def _add_images(
         self,
-        mapping: ImageRecords,
+        data: KaptureData,
         recording: Recording,
-        root: Path,
-        cams_from_local: Mapping[int, RigidTransform],
+        calibration: StereoCalibration,
+        car: str,
+        times: Iterable[int],
+        missing: Missing,
     ) -> None:
-        times: Iterable[int] = sorted(cams_from_local)
-        if self.options.frames == "all":
-            times = recording.times_on_disk(CAMERAS[0])
-        calibration = recording.calibration(root)
-        car = mapping.add(recording, calibration, times)
-        timestamps = {timestamp for timestamp, _ in mapping.data.records_camera}
-        for timestamp, pose in cams_from_local.items():
-            if timestamp in timestamps:
-                mapping.data.trajectories[timestamp, car] = pose
+        """Add a recording's rig, and its images at these times (ns)."""
+        cameras = (calibration.cam0, calibration.cam1)[: 2 if self.options.stereo else 1]
+        cams_from_car = (RigidTransform.identity(), calibration.cam1_from_cam0)
+        sensors = [name + car.removeprefix(RIG) for name in CAMERAS]
+        members = data.rigs.setdefault(car, {})
+        for name, sensor, camera, cam_from_car in zip(
+            CAMERAS, sensors, cameras, cams_from_car, strict=False
+        ):
+            data.sensors[sensor] = Sensor.from_camera(camera, name=name)
+            members[sensor] = cam_from_car
+        for timestamp in times:
+            for name, sensor, _ in zip(CAMERAS, sensors, cameras, strict=False):
+                if missing.require(recording.image_file(timestamp, name)):
+                    image = recording.image(timestamp, name)
+                    data.records_camera[timestamp, sensor] = image
 
     def _query_times(
         self,
@@ -217,6 +229,15 @@ class FourSeasons:
         if not times:
             missing.require(recording.image_file(0, CAMERAS[0]).parent)
         return sorted(times)
+
+
+def _car_ids(calibrations: Mapping[str, StereoCalibration]) -> dict[str, str]:
+    """Return the rig of each recording; recordings with the same calibration share one."""
+    of_calibration: dict[StereoCalibration, str] = {}
+    for recording, calibration in calibrations.items():
+        car = f"{RIG}_{recording}" if of_calibration else RIG
+        of_calibration.setdefault(calibration, car)
+    return {recording: of_calibration[c] for recording, c in calibrations.items()}
 
 
 def _known_poses(
@@ -275,7 +296,9 @@ def _summary(
                 keyframes = poses[recording.name]
                 rows = len(keyframes.scene_from_cam) + len(keyframes.dropped)
                 counts.append(Count("  keyframes with a pose", len(keyframes.scene_from_cam), rows))
-    counts += [file.count() for file in chosen.files]
+    for file in chosen.files:
+        published = PUBLISHED_PAIRS.get((file.source, file.target))
+        counts.append(Count(f"pairs in {file.path.name}", len(file.rows), published))
     counts.append(Count("images with a pose in the map", len(mapping.poses())))
     counts.append(Count("queries", len(query.records_camera)))
     known = 0 if query_gt is None else len(query_gt.poses())
@@ -309,39 +332,7 @@ def _remarks(
     return remarks
 
 
-# ----------------------------------------------------------------------- images and challenges
-
-RIG = "car"
-
-
-@dataclass
-class ImageRecords:
-    """Images of the map or of the queries; both share the ``suffixes`` of sensor ids."""
-
-    suffixes: dict[StereoCalibration, str]
-    missing: Missing
-    stereo: bool
-    data: KaptureData = field(default_factory=KaptureData)
-
-    def add(
-        self, recording: Recording, calibration: StereoCalibration, times: Iterable[int]
-    ) -> str:
-        """Add a recording's images at these times (ns); return the id of the car."""
-        fresh = f"_{recording.name}" if self.suffixes else ""
-        suffix = self.suffixes.setdefault(calibration, fresh)
-        car = RIG + suffix
-        cameras = (calibration.cam0, calibration.cam1)[: 2 if self.stereo else 1]
-        cams_from_car = (RigidTransform.identity(), calibration.cam1_from_cam0)
-        members = self.data.rigs.setdefault(car, {})
-        for name, camera, cam_from_car in zip(CAMERAS, cameras, cams_from_car, strict=False):
-            self.data.sensors[name + suffix] = Sensor.from_camera(camera, name=name)
-            members[name + suffix] = cam_from_car
-        for timestamp in times:
-            for name, _ in zip(CAMERAS, cameras, strict=False):
-                if self.missing.require(recording.image_file(timestamp, name)):
-                    image = recording.image(timestamp, name)
-                    self.data.records_camera[timestamp, name + suffix] = image
-        return car
+# -------------------------------------------------------------------------------- challenges
 
 
 # a query may be matched with the images of this many keyframes before and after its reference
