@@ -144,7 +144,7 @@ class Result:
     Attributes
     ----------
     images : queries of the result, sorted; for a pose file only those with a pose.
-    confidences : confidences of poses without a status, from the JSON file next to a pose file.
+    statuses : of a pose file, only the confidences in the JSON file next to it.
     covariances : image -> (6, 6), as in ``Pose``.
     by_pair : pair -> ``cam_from_world`` of its query, if the result is MLAD's pose files.
     """
@@ -153,17 +153,9 @@ class Result:
     poses: Poses
     images: tuple[str, ...]
     statuses: Mapping[str, LocalizationResult] = field(default_factory=dict)
-    confidences: Mapping[str, float] = field(default_factory=dict)
     covariances: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     by_pair: Mapping[RelocalizationPair, RigidTransform] | None = None
     context: ResultContext = field(default_factory=ResultContext)
-
-    def poses_of_pairs(
-        self, pairs: Iterable[RelocalizationPair]
-    ) -> Mapping[RelocalizationPair, RigidTransform]:
-        if self.by_pair is not None:
-            return self.by_pair
-        return {pair: self.poses[pair.query] for pair in pairs if pair.query in self.poses}
 
 
 def read_result(
@@ -198,7 +190,12 @@ def read_result(
         poses = pose_files.poses_by_image(read_poses(path), images, benchmark.names)
     if benchmark.world != World():
         poses = {image: benchmark.world.pose_in_local(pose) for image, pose in poses.items()}
-    return Result(label, poses, tuple(sorted(poses)), confidences=pose_files.read_confidences(path))
+    statuses = {
+        image: LocalizationResult(name=image, confidence=confidence)
+        for image, confidence in pose_files.read_confidences(path).items()
+        if image in poses
+    }
+    return Result(label, poses, tuple(sorted(poses)), statuses)
 
 
 def read_poses(source: Path) -> dict[str, RigidTransform]:

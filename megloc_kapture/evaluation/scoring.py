@@ -300,7 +300,7 @@ def query_result(
     if status is None:
         outcome: Outcome = "missing" if pose is None else "localized"
         reason = NO_POSE if pose is None else ""
-        status = LocalizationResult(confidence=result.confidences.get(image))
+        status = LocalizationResult()
     elif pose is not None and status.fallback == "none":
         outcome, reason = "localized", ""
     elif pose is not None:
@@ -336,7 +336,9 @@ def evaluate_pairs(
     FILE". Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the
     relative translation; ``by_center`` has those of the camera centre.
     """
-    pairs, estimated = benchmark.relocalization, result.poses_of_pairs(benchmark.relocalization)
+    pairs, estimated = benchmark.relocalization, result.by_pair
+    if estimated is None:
+        estimated = {pair: result.poses[pair.query] for pair in pairs if pair.query in result.poses}
     absent = next((pair for pair in pairs if pair.reference not in references), None)
     if absent is not None:
         raise DataError(f"reference {absent.reference!r} of {absent.file!r} has no pose in the map")

@@ -111,7 +111,7 @@ def evaluate_poses(
     nowhere: Collection[str] = (),
     **options: Any,
 ) -> Evaluation:
-    """``options`` are statuses, confidences and covariances by image."""
+    """``options`` are statuses and covariances by image."""
     groups = {
         image: ImageGroup(
             condition=(conditions or {}).get(image, ""), scored=scored is None or image in scored
