@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, is_dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, is_dataclass
 from itertools import groupby
 from pathlib import Path
 from textwrap import fill
@@ -30,7 +30,7 @@ from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.report import content
 from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries, worst_queries
 from megloc_kapture.evaluation.results import Poses, first_map_poses
-from megloc_kapture.evaluation.scoring import Evaluation, QueryResult, Reported
+from megloc_kapture.evaluation.scoring import Evaluation, Reported
 from megloc_kapture.io.files import write_bytes, write_json
 from megloc_kapture.values import MIN_CONFIDENCE
 
@@ -214,30 +214,32 @@ def plain(data: Any) -> Any:
     return None if isinstance(data, float) and not np.isfinite(data) else data
 
 
-@dataclass
-class Section:
-    """A card of the page."""
+def _section(
+    heading: str,
+    paragraphs: Sequence[str] = (),
+    body: Iterable[Markup | None] = (),
+    pictures: Sequence[Picture] = (),
+) -> dict[str, Any]:
+    """Return a card of the page; parts of the body that are None are left out."""
+    parts = [part for part in body if part is not None]
+    return {"heading": heading, "paragraphs": paragraphs, "body": parts, "pictures": pictures}
 
-    heading: str
-    paragraphs: list[str] = field(default_factory=list)
-    body: list[Markup] = field(default_factory=list)
-    pictures: Sequence[Picture] = ()
 
-    def text(self, text: str) -> None:
-        self.body.append(Markup("<p>{}</p>").format(text))
+def _table(frame: DataFrame | None) -> Markup | None:
+    if frame is None:
+        return None
+    import pandas as pd
 
-    def table(self, frame: DataFrame | None) -> None:
-        if frame is not None:
-            import pandas as pd
+    with pd.option_context("display.max_colwidth", None):
+        html = frame.to_html(index=False, border=0, justify="left")
+    return Markup('<div class="scroll">{}</div>').format(Markup(html))
 
-            with pd.option_context("display.max_colwidth", None):
-                html = frame.to_html(index=False, border=0, justify="left")
-            self.body.append(Markup('<div class="scroll">{}</div>').format(Markup(html)))
 
-    def figure(self, svg: bytes | None) -> None:
-        if svg is not None:
-            data = base64.b64encode(svg).decode("ascii")
-            self.body.append(Markup('<img src="data:image/svg+xml;base64,{}">').format(data))
+def _figure(svg: bytes | None) -> Markup | None:
+    if svg is None:
+        return None
+    data = base64.b64encode(svg).decode("ascii")
+    return Markup('<img src="data:image/svg+xml;base64,{}">').format(data)
 
 
 def render_report(
@@ -259,7 +261,7 @@ def render_report(
         title=" and ".join(evaluation.label for evaluation in evaluations) or "Evaluation",
         view=VIEW_HTML if has_view else "",
         steps=values.pop("steps", []),
-        sections=[s for s in sections if s.body or s.pictures or not s.heading],
+        sections=[section for section in sections if section["body"] or section["pictures"]],
         versions=package_versions(),
         provenance=json.dumps(values, indent=2, ensure_ascii=False) if values else "",
     )
@@ -278,86 +280,77 @@ def template(name: str) -> Template:
     return environment.get_template(name)
 
 
-def _summary(reported: Reported) -> Section:
-    section = Section("Summary" if isinstance(reported, WithoutTruth) else "Recall")
+def _summary(reported: Reported) -> dict[str, Any]:
+    body: list[Markup | None] = []
     for text, table in _facts(reported):
-        for line in text.splitlines():
-            section.text(line)
-        section.table(table)
-    return section
+        body += [Markup("<p>{}</p>").format(line) for line in text.splitlines()]
+        body.append(_table(table))
+    return _section("Summary" if isinstance(reported, WithoutTruth) else "Recall", body=body)
 
 
-def _error_curves(evaluations: Sequence[Evaluation]) -> Section:
+def _error_curves(evaluations: Sequence[Evaluation]) -> dict[str, Any]:
     from megloc_kapture.evaluation.report import figures  # loads matplotlib
 
     explanation = (
         "Share of all queries at or below an error, separately for position and rotation; queries "
         "without a pose keep the curves below 100 %. Dotted: the thresholds."
     )
-    section = Section("Errors", [explanation])
-    section.figure(figures.error_curves(evaluations))
-    return section
+    return _section("Errors", [explanation], [_figure(figures.error_curves(evaluations))])
 
 
-def _sections_of(evaluation: Evaluation, map_poses: Poses, *, several: bool) -> list[Section]:
+def _sections_of(
+    evaluation: Evaluation, map_poses: Poses, *, several: bool
+) -> Iterator[dict[str, Any]]:
     from megloc_kapture.evaluation.report import figures, gallery
 
     whose = f"{evaluation.label}: " if several else ""
-    context, queries = evaluation.context, shown_queries(evaluation)
-    above = Section(f"{whose}From above")
-    if evaluation.truth:
-        above.paragraphs.append("Red lines lead from the true camera centre to the estimate.")
+    context, queries, has_truth = (
+        evaluation.context,
+        shown_queries(evaluation),
+        bool(evaluation.truth),
+    )
+    above: list[Markup | None] = []
     views = figures.views_from_above(queries, map_poses, context.frames, context.unit)
     for frame, svg in views.items():
-        above.body += [Markup("<h3>{}</h3>").format(frame)] if frame else []
-        above.figure(svg)
-    sections = [above]
-    if evaluation.truth:
-        inliers = Section(
-            f"{whose}Error against inliers",
-            [
-                "Errors should decrease to the right. A pose with many inliers and a large error "
-                "is typically in a wrong but similar location."
-            ],
+        above += [Markup("<h3>{}</h3>").format(frame)] if frame else []
+        above.append(_figure(svg))
+    lines = "Red lines lead from the true camera centre to the estimate."
+    yield _section(f"{whose}From above", [lines] if has_truth else [], above)
+    if has_truth:
+        explanation = (
+            "Errors should decrease to the right. A pose with many inliers and a large error is "
+            "typically in a wrong but similar location."
         )
-        inliers.figure(figures.errors_against_inliers(evaluation))
-        sections += [inliers, _confidence(evaluation, whose)]
-    refined = Section(f"{whose}Changes by refinement", ["Medians over the accepted poses."])
-    refined.paragraphs += [
-        _sentence(content.consistency_sentence(row)) for row in context.consistency
-    ]
-    refined.table(content.refinement_table(evaluation))
-    which = "true" if evaluation.truth else "estimated"
-    lines = (
-        f"Left: the query; right: the candidate with the most matches. Green matches agree with "
-        f"the {which} pose, red ones are more than 8 pixels from their epipolar line."
+        inliers = _figure(figures.errors_against_inliers(evaluation))
+        yield _section(f"{whose}Error against inliers", [explanation], [inliers])
+        explanation = (
+            "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses "
+            "are accepted in order of decreasing confidence."
+        )
+        confidence, curves = evaluation.confidence, None
+        if confidence is not None and confidence.num_poses >= content.FEW:
+            curves = _figure(figures.confidence_curves(confidence))
+        yield _section(f"{whose}Confidence", [explanation], [curves])
+    checks = [_sentence(content.consistency_sentence(row)) for row in context.consistency]
+    yield _section(
+        f"{whose}Changes by refinement",
+        ["Medians over the accepted poses.", *checks],
+        [_table(content.refinement_table(evaluation))],
+    )
+    explanation = (
+        "Left: the query; right: the candidate with the most matches. Green matches agree with the "
+        f"{'true' if has_truth else 'estimated'} pose, red ones are more than 8 pixels from their "
+        "epipolar line."
     )
     pictures = gallery.worst_pictures(worst_queries(queries), context, map_poses)
-    sections += [refined, Section(f"{whose}The worst queries", [lines], pictures=pictures)]
-    if evaluation.truth and not several:
-        sections.append(_query_list(evaluation, queries))
-    return sections
-
-
-def _query_list(evaluation: Evaluation, queries: Sequence[QueryResult]) -> Section:
-    section = Section("Queries, the worst first")
-    if len(queries) > _MAX_ROWS:
-        section.paragraphs.append(f"The worst {_MAX_ROWS} of {len(queries)}.")
-    section.table(content.query_table(evaluation, queries[:_MAX_ROWS]))
-    return section
-
-
-def _confidence(evaluation: Evaluation, whose: str) -> Section:
-    from megloc_kapture.evaluation.report import figures
-
-    explanation = (
-        "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses are "
-        "accepted in order of decreasing confidence."
-    )
-    section, confidence = Section(f"{whose}Confidence", [explanation]), evaluation.confidence
-    if confidence is not None and confidence.num_poses >= content.FEW:
-        section.figure(figures.confidence_curves(confidence))
-    return section
+    yield _section(f"{whose}The worst queries", [explanation], pictures=pictures)
+    if has_truth and not several:
+        omitted = f"The worst {_MAX_ROWS} of {len(queries)}."
+        yield _section(
+            "Queries, the worst first",
+            [omitted] if len(queries) > _MAX_ROWS else [],
+            [_table(content.query_table(evaluation, queries[:_MAX_ROWS]))],
+        )
 
 
 def _view(reported: Reported) -> str | None:
