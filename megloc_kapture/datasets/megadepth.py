@@ -14,7 +14,6 @@ are not read; docs/training.md shows how to convert them to plain arrays.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
@@ -51,12 +50,8 @@ class MegaDepthOptions(Options):
     )
 
 
-@dataclass(frozen=True)
-class _Image:
-    path: Path
-    depth: Path
-    camera: Camera
-    cam_from_world: RigidTransform
+# files of image and depth, camera, and ``cam_from_world``
+_Image = tuple[Path, Path, Camera, RigidTransform]
 
 
 def import_megadepth(
@@ -112,7 +107,7 @@ def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Im
         path = safe_join(folder, image.name)
         depth = _depth_of(root, scene, image.name)
         if path.is_file() and depth is not None:
-            yield _Image(path, depth, reconstruction.cameras[image.camera_id], image.cam_from_world)
+            yield path, depth, reconstruction.cameras[image.camera_id], image.cam_from_world
 
 
 def _depth_of(root: Path, scene: str, image: str) -> Path | None:
@@ -133,26 +128,26 @@ def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
         k = intrinsics[row]
         camera = Camera("PINHOLE", *image_size(path), (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
         pose = poses[row]
-        yield _Image(path, depth, camera, RigidTransform.from_matrix(pose[:3, :3], pose[:3, 3]))
+        yield path, depth, camera, RigidTransform.from_matrix(pose[:3, :3], pose[:3, 3])
 
 
 def _write_scene(output: Path, images: Sequence[_Image] | Iterator[_Image]) -> int:
     data, links = KaptureData(), {}
-    for number, image in enumerate(images):
-        depth_m = read_megadepth_depth(image.depth)
+    for number, (path, depth, camera, cam_from_world) in enumerate(images):
+        depth_m = read_megadepth_depth(depth)
         if depth_m is None:
             continue
-        name = f"images/{image.path.name}"
-        require(name not in links, "the scene has two images with this name", path=image.path)
-        links[name] = image.path
+        name = f"images/{path.name}"
+        require(name not in links, "the scene has two images with this name", path=path)
+        links[name] = path
         sensor, depth_sensor, rig = f"{number}", f"{number}_depth", f"{number}_rig"
-        depth_camera = scaled_camera(image.camera, depth_m.shape[1], depth_m.shape[0])
-        data.sensors[sensor] = Sensor.from_camera(image.camera)
+        depth_camera = scaled_camera(camera, depth_m.shape[1], depth_m.shape[0])
+        data.sensors[sensor] = Sensor.from_camera(camera)
         data.sensors[depth_sensor] = Sensor.from_camera(depth_camera, sensor_type="depth")
         data.rigs[rig] = {sensor: _IDENTITY, depth_sensor: _IDENTITY}
-        data.trajectories[number, rig] = image.cam_from_world
+        data.trajectories[number, rig] = cam_from_world
         data.records_camera[number, sensor] = name
-        record = f"depth/{image.path.stem}.depth"
+        record = f"depth/{path.stem}.depth"
         data.records_depth[number, depth_sensor] = record
         write_depth_map(output / "sensors" / "records_data" / record, depth_m)
     write_sensors(output, data)
