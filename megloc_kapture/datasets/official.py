@@ -129,7 +129,6 @@ class OfficialDataset(SideTables):
     links: Mapping[str, Path] = field(default_factory=dict)
     image_files: Mapping[str, Path] = field(default_factory=dict)
     query_gt: KaptureData | None = None
-    world: World = World()
     summary: Sequence[Count] = ()
     remarks: Sequence[str] = ()
     missing: Missing | None = None

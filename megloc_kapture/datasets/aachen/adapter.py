@@ -235,7 +235,7 @@ def _version_of(form: KaptureForm, wanted: Wanted, images: Sequence[KaptureImage
 class AachenOptions(Options):
     """The part of Aachen Day-Night to import."""
 
-    version: Literal["auto", "1.0", "1.1"] = Field(
+    version: Wanted = Field(
         default="auto",
         description="version of the dataset; auto: 1.1 if 3D-models/aachen_v_1_1 exists",
     )

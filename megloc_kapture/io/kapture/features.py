@@ -165,10 +165,7 @@ class Blobs:
         return sorted(names)
 
     def __contains__(self, name: str) -> bool:
-        try:
-            return name in self._members or os.path.isfile(self._file(name))
-        except DataError:
-            return False
+        return name in self._members or os.path.isfile(self._file(name))
 
     def size(self, name: str) -> int:
         if name in self._members:
