@@ -16,7 +16,6 @@ from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
-from megloc_kapture.io.files import named
 from megloc_kapture.io.text_lines import reading_lines, transform_of
 from megloc_kapture.values import RigidTransform
 
@@ -287,45 +286,39 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     # version 1 does not need the training list
     wanted = version == 2 and missing.require(layout.train_list)
     if wanted or layout.train_list.is_file():
-        for image, cam_from_world in read_train_poses(layout.train_list).items():
-            with named(layout.train_list):
-                known = _scored_query(image, at_time, allow_missing)
-            unlisted += known is None
-            if known is not None:
-                train[known] = cam_from_world
+        path = layout.train_list
+        train, unlisted = known_queries(
+            path, read_train_poses(path), at_time, allow_missing=allow_missing
+        )
     if version == 2 and missing.require(layout.test_list):
-        test, more = read_test_names(layout.test_list, at_time, allow_missing=allow_missing)
+        path = layout.test_list
+        test, more = known_queries(path, read_test_list(path), at_time, allow_missing=allow_missing)
         unlisted += more
     return Queries(locations, train, test, unlisted)
 
 
-def read_test_names(
-    path: Path, at_time: Mapping[tuple[str, int], ImageKey], *, allow_missing: bool
-) -> tuple[dict[ImageKey, str], int]:
-    """Read version 2's test list; return query -> its text in the list, and a count.
+def known_queries(
+    path: Path,
+    entries: Mapping[ImageKey, Value],
+    at_time: Mapping[tuple[str, int], ImageKey],
+    *,
+    allow_missing: bool,
+) -> tuple[dict[ImageKey, Value], int]:
+    """Return the entries of a list of version 2 by query, and the number of entries without one.
 
-    The count is that of entries that ``queries_per_location`` lacks.
+    ``at_time`` are the queries of ``queries_per_location`` by camera and time.
     """
-    test: dict[ImageKey, str] = {}
-    unlisted = 0
-    for image, text in read_test_list(path).items():
-        with named(path):
-            known = _scored_query(image, at_time, allow_missing)
-        unlisted += known is None
-        if known is not None:
-            test[known] = text
-    return test, unlisted
-
-
-def _scored_query(
-    image: ImageKey, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
-) -> ImageKey | None:
-    nearest = at_time.get((image.camera, image.timestamp))
-    if nearest is not None and image.condition in ("", nearest.condition):
-        return nearest
-    if allow_missing:
-        return None
-    raise DataError(
-        f"{image.camera}/{image.stem} is in no list of queries_per_location; "
-        "--allow-missing leaves it out"
-    )
+    values, unlisted = dict[ImageKey, Value](), 0
+    for image, value in entries.items():
+        query = at_time.get((image.camera, image.timestamp))
+        if query is not None and image.condition in ("", query.condition):
+            values[query] = value
+        elif allow_missing:
+            unlisted += 1
+        else:
+            raise DataError(
+                f"{image.camera}/{image.stem} is in no list of queries_per_location; "
+                "--allow-missing leaves it out",
+                path=path,
+            )
+    return values, unlisted

@@ -17,9 +17,10 @@ from megloc_kapture.datasets.robotcar import (
     Layout,
     Queries,
     Reference,
+    known_queries,
     parse_image,
     read_intrinsics,
-    read_test_names,
+    read_test_list,
 )
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
@@ -250,7 +251,9 @@ def queries_of_kapture(
     unlisted = 0
     if version == 2 and test_list.is_file():
         at_time = {(key.camera, key.timestamp): key for key in keys}
-        test, unlisted = read_test_names(test_list, at_time, allow_missing=allow_missing)
+        test, unlisted = known_queries(
+            test_list, read_test_list(test_list), at_time, allow_missing=allow_missing
+        )
     elif version == 2:
         test = {key: f"{key.camera}/{key.stem}.png" for key in poses if key not in train}
     return version, Queries({key: images[key].locations for key in keys}, train, test, unlisted)
