@@ -110,7 +110,7 @@ class FourSeasons:
             recording.calibration(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        missing = Missing(root)
+        missing, quality = Missing(root), self.options.min_fusion_quality
         chosen = select(root, self.options.reference, self.options.queries, missing)
         used = (*chosen.references, *chosen.queries)
         poses = self._reference_poses(chosen.references, missing)
@@ -130,7 +130,9 @@ class FourSeasons:
         truth: dict[tuple[int, str], RigidTransform] = {}
         for recording in chosen.queries:
             name = recording.name
-            published = self._poses(recording, missing) if frame.earth_from_scene else None
+            published = None
+            if frame.earth_from_scene is not None:
+                published = read_keyframe_poses(recording, quality, missing)
             known = {} if published is None else frame.cams_from_local(published)
             times = self._query_times(recording, known, chosen.files, missing)
             self._add_images(query, recording, calibrations[name], cars[name], times, missing)
@@ -162,25 +164,19 @@ class FourSeasons:
             relocalization=pairs,
             world=frame.world(),
             summary=_summary(chosen, poses, mapping, query, query_gt),
-            remarks=_remarks(poses, frame, lost, self.options.min_fusion_quality),
+            remarks=_remarks(poses, frame, lost, quality),
             missing=missing,
-        )
-
-    def _poses(
-        self, recording: Recording, missing: Missing, *, on_earth: bool = True
-    ) -> KeyframePoses | None:
-        quality = self.options.min_fusion_quality
-        return read_keyframe_poses(
-            recording, min_fusion_quality=quality, on_earth=on_earth, missing=missing
         )
 
     def _reference_poses(
         self, references: Sequence[Recording], missing: Missing
     ) -> dict[str, KeyframePoses]:
-        poses_of = {}
+        poses_of, quality = {}, self.options.min_fusion_quality
         for recording in references:
             # poses.txt cannot be used for several recordings: each file has a separate frame
-            keyframes = self._poses(recording, missing, on_earth=len(references) > 1)
+            keyframes = read_keyframe_poses(
+                recording, quality, missing, on_earth=len(references) > 1
+            )
             if keyframes is None:
                 raise DataError(
                     f"no poses for the map: {GNSS_POSES} and {TRANSFORMATIONS} are needed"
@@ -437,7 +433,7 @@ class LocalFrame:
 
 
 def read_keyframe_poses(
-    recording: Recording, *, min_fusion_quality: int, on_earth: bool, missing: Missing
+    recording: Recording, min_fusion_quality: int, missing: Missing, *, on_earth: bool = True
 ) -> KeyframePoses | None:
     """Return the published keyframe poses, or None; ``on_earth`` rules out ``poses.txt``."""
     plain = recording.folder / POSES

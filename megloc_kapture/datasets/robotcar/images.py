@@ -77,7 +77,7 @@ def select(
         taken = set(_of_moments(queries.locations, train))
         wanted = [image for image in wanted if image not in taken]
 
-    def found(images: Iterable[ImageKey]) -> dict[ImageKey, str]:
+    def with_paths(images: Iterable[ImageKey]) -> dict[ImageKey, str]:
         paths = ((image, find(image)) for image in images if image.camera in cameras)
         return {image: path for image, path in paths if path is not None}
 
@@ -85,9 +85,9 @@ def select(
         version,
         reference,
         queries,
-        map_images=found(reference.poses),
-        train_images=found(train),
-        query_images=found(wanted),
+        map_images=with_paths(reference.poses),
+        train_images=with_paths(train),
+        query_images=with_paths(wanted),
     )
 
 

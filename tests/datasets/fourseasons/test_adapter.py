@@ -254,9 +254,8 @@ def sample(shared_data: Path, tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_all_poses_of_the_published_sample_equal_those_of_kapture(sample: Path) -> None:
     folder = sample / "a_map"
-    poses = read_keyframe_poses(
-        Recording("a_map", folder), min_fusion_quality=1, on_earth=False, missing=Missing(sample)
-    )
+    recording = Recording("a_map", folder)
+    poses = read_keyframe_poses(recording, 1, Missing(sample), on_earth=False)
     assert poses is not None
     frame = LocalFrame.around(poses)
     theirs = import_4seasons_trajectory(
