@@ -186,9 +186,6 @@ def difference_interval(
 CAUTION = "These figures do not measure accuracy: results that share a mistake agree."
 
 
-Quartiles = tuple[float, float, float]
-
-
 @dataclass(frozen=True, slots=True)
 class AgreementRow:
     """Agreement of two results in one row of the table.
@@ -311,7 +308,7 @@ def _counted(
     )
 
 
-def inliers_quartiles(evaluation: Evaluation, row: str) -> Quartiles | None:
+def inliers_quartiles(evaluation: Evaluation, row: str) -> tuple[float, float, float] | None:
     """Return the quartiles of the inlier counts of localized queries; None if unknown."""
     inliers = [
         query.num_inliers

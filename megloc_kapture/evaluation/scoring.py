@@ -194,9 +194,6 @@ class Evaluation(Reported):
                 return row
         raise KeyError(name)
 
-    def image(self, query: str) -> str:
-        return self.pairs[query].query if query in self.pairs else query
-
 
 def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
     columns = {

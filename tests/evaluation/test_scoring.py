@@ -174,7 +174,7 @@ def test_mlad_pairs_and_conditions() -> None:
         "q1.png",
         "q3.png",
     )
-    assert actual.image(actual.errors.names[0]) == "q0.png"
+    assert actual.pairs[actual.errors.names[0]].query == "q0.png"
     assert [at.num_within for at in actual.row("town_2").recall] == [2, 2, 2]
     assert [at.num_within for at in actual.row("park_2").recall] == [0, 0, 1]
     assert actual.queries[-1].reason == "dark"

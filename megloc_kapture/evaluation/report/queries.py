@@ -57,16 +57,16 @@ def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
     """
     shown = []
     for query in evaluation.queries:
-        candidates = query.candidates
-        if query.name in evaluation.pairs and not candidates:
-            candidates = (evaluation.pairs[query.name].reference,)
+        image, candidates = query.name, query.candidates
+        if (pair := evaluation.pairs.get(query.name)) is not None:
+            image, candidates = pair.query, candidates or (pair.reference,)
         color, meaning = NO_POSE_COLOR, "no pose"
         if query.cam_from_world is not None:
             color, meaning = _color(query, evaluation.thresholds)
         shown.append(
             replace(
                 query,
-                image=evaluation.image(query.name),
+                image=image,
                 candidates=candidates,
                 truth=evaluation.truth.get(query.name),
                 color=color,
