@@ -299,8 +299,6 @@ def _counted(
         rows=recall_rows(queries, errors, (), members),
         members=members,
         queries=queries,
-        errors=errors,
-        truth={},
         estimated=result.poses,
         without_truth=(),
         not_scored=(),

@@ -62,7 +62,8 @@ class QueryResult(LocalizationResult):
     outcome : ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
     position_m, angle_deg : errors; infinite without a pose and for a query that shows nothing of
         the map, NaN in a comparison without ground truth.
-    truth, color, meaning : for reports, see :func:`~.report.queries.shown_queries`.
+    truth : true ``cam_from_world``, if known.
+    color, meaning : for reports, see :func:`~.report.queries.shown_queries`.
     """
 
     image: str
@@ -121,14 +122,14 @@ class Reported:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evaluation(Reported):
-    """Evaluation of one result; without true poses ``truth`` and ``thresholds`` are empty.
+    """Evaluation of one result; without true poses ``thresholds`` is empty.
 
     Attributes
     ----------
     rows : recall per condition, per pool, and of ``"all"``, which is the last.
     members : row name -> mask (N,) of its queries.
-    queries, errors : N counted queries, sorted by name, and their errors.
-    truth, estimated : ``cam_from_world`` of counted queries.
+    queries : N counted queries, sorted by name.
+    estimated : ``cam_from_world`` of counted queries.
     without_truth : images or pairs without a true pose, sorted; reported but not counted.
     not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
     truth_known_by : note on true poses that are not published; else empty.
@@ -145,8 +146,6 @@ class Evaluation(Reported):
     rows: tuple[RecallRow, ...]
     members: Mapping[str, NDArray[np.bool_]]
     queries: tuple[QueryResult, ...]
-    errors: PoseErrors
-    truth: Poses
     estimated: Poses
     without_truth: tuple[str, ...]
     not_scored: tuple[str, ...]
@@ -163,6 +162,18 @@ class Evaluation(Reported):
         return (self,)
 
     @property
+    def has_truth(self) -> bool:
+        return bool(self.thresholds)
+
+    @property
+    def errors(self) -> PoseErrors:
+        return PoseErrors(
+            tuple(query.image for query in self.queries),
+            np.array([query.position_m for query in self.queries], np.float64),
+            np.array([query.angle_deg for query in self.queries], np.float64),
+        )
+
+    @property
     def confidence(self) -> Confidence | None:
         return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
 
@@ -177,9 +188,8 @@ class Evaluation(Reported):
             query.confidence is not None and query.confidence < min_confidence
             for query in self.queries
         ]
-        position_m = np.where(doubtful, np.inf, self.errors.position_m)
-        angle_deg = np.where(doubtful, np.inf, self.errors.angle_deg)
-        errors = PoseErrors(self.errors.names, position_m, angle_deg)
+        errors = self.errors
+        errors.position_m[doubtful] = errors.angle_deg[doubtful] = np.inf
         return recall_rows(self.queries, errors, self.thresholds, self.members)
 
     def compare(self, *others: Evaluation) -> Comparison:
@@ -199,7 +209,7 @@ def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
     columns = {
         name: [getattr(query, attribute) for query in evaluation.queries]
         for name, attribute in _COLUMNS.items()
-        if evaluation.truth or "error" not in name
+        if evaluation.has_truth or "error" not in name
     }
     if all(confidence is None for confidence in columns["confidence"]):
         del columns["confidence"]
@@ -236,7 +246,7 @@ def evaluate_poses(
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
     queries = tuple(
-        query_result(result, name, conditions, (position_m, angle_deg))
+        query_result(result, name, conditions, (position_m, angle_deg), truth[name])
         for name, position_m, angle_deg in zip(
             counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
         )
@@ -249,8 +259,6 @@ def evaluate_poses(
         rows=recall_rows(queries, errors, thresholds, members),
         members=members,
         queries=queries,
-        errors=errors,
-        truth={name: truth[name] for name in counted},
         estimated=estimated,
         covariance=_check_covariances(queries, result, truth),
         nowhere=tuple(
@@ -289,7 +297,11 @@ def recall_rows(
 
 
 def query_result(
-    result: Result, image: str, conditions: Mapping[str, str], errors: tuple[float, float]
+    result: Result,
+    image: str,
+    conditions: Mapping[str, str],
+    errors: tuple[float, float],
+    truth: RigidTransform | None = None,
 ) -> QueryResult:
     """Return the outcome of a query with errors in metres and degrees."""
     pose = result.poses.get(image)
@@ -316,6 +328,7 @@ def query_result(
         outcome=outcome,
         position_m=errors[0],
         angle_deg=errors[1],
+        truth=truth,
     )
 
 
@@ -362,8 +375,7 @@ def evaluate_pairs(
         ),
         thresholds=thresholds,
     )
-    names = by_center.errors.names
-    has_pose = by_center.errors.has_pose
+    names, has_pose = by_center.errors.names, by_center.errors.has_pose
     posed = [name for name, has in zip(names, has_pose, strict=True) if has]
     world_from_reference = invert(*stack_poses(references[named[name].reference] for name in posed))
     _, translations = compose(
@@ -381,7 +393,6 @@ def evaluate_pairs(
     )
     return replace(
         by_center,
-        errors=errors,
         queries=queries,
         rows=recall_rows(queries, errors, by_center.thresholds, by_center.members),
         without_truth=tuple(sorted(n for n, p in named.items() if p.query not in truth)),

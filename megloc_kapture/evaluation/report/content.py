@@ -365,7 +365,8 @@ def query_table(evaluation: Evaluation, queries: Sequence[QueryResult]) -> DataF
 
 def refinement_table(evaluation: Evaluation) -> DataFrame | None:
     """Summarize pose refinement, one row per method; None if nothing was refined."""
-    estimated, truth = evaluation.estimated, evaluation.truth
+    estimated = evaluation.estimated
+    truth = {q.image: q.truth for q in evaluation.queries if q.truth is not None}
     by_method: dict[str, list[tuple[str, PoseRefinement]]] = {}
     for image, steps in sorted(evaluation.context.refinements.items()):
         if image in estimated:

@@ -51,7 +51,7 @@ def query_facts(query: QueryResult) -> list[str]:
 
 
 def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
-    """Return all queries, with true poses if known and colours, worst first.
+    """Return all queries with colours, worst first.
 
     ``image`` is the image's name in the dataset, also for MLAD's pairs.
     """
@@ -68,7 +68,6 @@ def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
                 query,
                 image=image,
                 candidates=candidates,
-                truth=evaluation.truth.get(query.name),
                 color=color,
                 meaning=meaning,
             )

@@ -307,7 +307,7 @@ def _sections_of(
     context, queries, has_truth = (
         evaluation.context,
         shown_queries(evaluation),
-        bool(evaluation.truth),
+        evaluation.has_truth,
     )
     above: list[Markup | None] = []
     views = figures.views_from_above(queries, map_poses, context.frames, context.unit)
