@@ -46,7 +46,7 @@ NO_POSE = "no pose in the result"
 Outcome = Literal["localized", "fallback", "missing"]
 # column of a table of queries -> attribute
 _COLUMNS = {
-    **{name: name for name in ("image", "condition", "outcome")},
+    **{"image": "name", "condition": "condition", "outcome": "outcome"},
     **{"position_error_m": "position_m", "angle_error_deg": "angle_deg"},
     **{name: name for name in ("num_matches", "num_inliers", "confidence", "reason")},
 }
@@ -58,7 +58,7 @@ class QueryResult(LocalizationResult):
 
     Attributes
     ----------
-    image : name of the query; in an evaluation of pairs, the name of the pair.
+    image : image of the query in the dataset; in an evaluation of pairs, ``name`` is the pair's.
     outcome : ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
     position_m, angle_deg : errors; infinite without a pose and for a query that shows nothing of
         the map, NaN in a comparison without ground truth.
@@ -168,7 +168,7 @@ class Evaluation(Reported):
     @property
     def errors(self) -> PoseErrors:
         return PoseErrors(
-            tuple(query.image for query in self.queries),
+            tuple(query.name for query in self.queries),
             np.array([query.position_m for query in self.queries], np.float64),
             np.array([query.angle_deg for query in self.queries], np.float64),
         )
@@ -215,7 +215,7 @@ def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
         del columns["confidence"]
     if evaluation.by_center is not None:
         pairs, centers = evaluation.pairs, evaluation.by_center.queries
-        columns["reference"] = [pairs[query.image].reference for query in evaluation.queries]
+        columns["reference"] = [pairs[query.name].reference for query in evaluation.queries]
         columns["center_error_m"] = [query.position_m for query in centers]
     return columns
 
@@ -275,7 +275,7 @@ def _check_covariances(
     queries: Sequence[QueryResult], result: Result, truth: Poses
 ) -> dict[str, int] | None:
     covariances = result.covariances
-    names = [q.image for q in queries if q.outcome == "localized" and q.image in covariances]
+    names = [q.name for q in queries if q.outcome == "localized" and q.name in covariances]
     within = sum(
         squared_distance(truth[name], result.poses[name], covariances[name]) <= _CHI2_95
         for name in names
@@ -388,7 +388,12 @@ def evaluate_pairs(
     position_m[has_pose] = np.linalg.norm(translations - true_translations, axis=1)
     errors = PoseErrors(names, position_m, by_center.errors.angle_deg)
     queries = tuple(
-        replace(query, position_m=error_m)
+        replace(
+            query,
+            position_m=error_m,
+            image=named[query.name].query,
+            candidates=query.candidates or (named[query.name].reference,),
+        )
         for query, error_m in zip(by_center.queries, position_m.tolist(), strict=True)
     )
     return replace(

@@ -102,7 +102,7 @@ def notes(evaluation: Evaluation) -> list[str]:
         )
     if row.num_missing == row.num_queries:
         sentences.append("no query has a pose")
-    elif absent := [q.image for q in evaluation.queries if q.reason == NO_POSE]:
+    elif absent := [q.name for q in evaluation.queries if q.reason == NO_POSE]:
         lack = counted(len(absent), "query has", "queries have")
         sentences.append(
             f"{lack} no pose in the result: {_first(absent)}; if these are map images, give true "
@@ -338,7 +338,7 @@ def agreement_table(results: WithoutTruth, rows: Iterable[AgreementRow]) -> Data
 def query_table(evaluation: Evaluation, queries: Sequence[QueryResult]) -> DataFrame:
     """Return one row per query, without columns that are empty."""
     centers = evaluation.by_center
-    of_center = {} if centers is None else {q.image: q.position_m for q in centers.queries}
+    of_center = {} if centers is None else {q.name: q.position_m for q in centers.queries}
 
     def number(value: float | None, form: Any) -> str:
         return form(value) if value is not None and np.isfinite(value) else ""
@@ -366,7 +366,7 @@ def query_table(evaluation: Evaluation, queries: Sequence[QueryResult]) -> DataF
 def refinement_table(evaluation: Evaluation) -> DataFrame | None:
     """Summarize pose refinement, one row per method; None if nothing was refined."""
     estimated = evaluation.estimated
-    truth = {q.image: q.truth for q in evaluation.queries if q.truth is not None}
+    truth = {q.name: q.truth for q in evaluation.queries if q.truth is not None}
     by_method: dict[str, list[tuple[str, PoseRefinement]]] = {}
     for image, steps in sorted(evaluation.context.refinements.items()):
         if image in estimated:

@@ -51,27 +51,13 @@ def query_facts(query: QueryResult) -> list[str]:
 
 
 def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
-    """Return all queries with colours, worst first.
-
-    ``image`` is the image's name in the dataset, also for MLAD's pairs.
-    """
+    """Return all queries with colours, worst first."""
     shown = []
     for query in evaluation.queries:
-        image, candidates = query.name, query.candidates
-        if (pair := evaluation.pairs.get(query.name)) is not None:
-            image, candidates = pair.query, candidates or (pair.reference,)
         color, meaning = NO_POSE_COLOR, "no pose"
         if query.cam_from_world is not None:
             color, meaning = _color(query, evaluation.thresholds)
-        shown.append(
-            replace(
-                query,
-                image=image,
-                candidates=candidates,
-                color=color,
-                meaning=meaning,
-            )
-        )
+        shown.append(replace(query, color=color, meaning=meaning))
     return sorted(shown, key=_worst_first)
 
 
