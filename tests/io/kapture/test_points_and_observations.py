@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from megloc_kapture.io.colmap import load_pycolmap
-from megloc_kapture.io.kapture import write_ply
 from megloc_kapture.io.kapture.points import (
     COVARIANCES_FILE,
     read_point_covariances,
     read_points3d,
+    write_ply,
     write_point_covariances,
     write_points3d,
 )

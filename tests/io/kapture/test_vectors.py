@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter, KaptureVectors
+from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter
+from megloc_kapture.io.kapture.features import KaptureVectors
 
 FOLDER = Path("reconstruction/global_features/G")
 NAMES = [f"{k % 3}/{k:03d}.jpg" for k in range(40)]
