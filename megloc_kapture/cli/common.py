@@ -45,6 +45,12 @@ Force = Annotated[
 ]
 Overwrite = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
 Folders = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
+AllowedLinks = Annotated[
+    Folders,
+    tyro.conf.arg(
+        help="No effect; accepted for older scripts. Links in kapture folders are always followed."
+    ),
+]
 Texts = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 Item = TypeVar("Item")
@@ -211,17 +217,10 @@ class Working(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Linked:
-    """Flag of commands that read kapture folders."""
-
-    allow_links_below: Folders = ()
-    """No effect; accepted for older scripts. Links in kapture folders are always followed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reading(Linked):
+class Reading:
     """Flags of commands that read features of kapture folders."""
 
+    allow_links_below: AllowedLinks = ()
     features_dir: Folders = ()
     """Folder with features outside the kapture folders; may be repeated."""
 

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 import tyro
 
 from megloc_kapture.cli.common import (
+    AllowedLinks,
     Common,
     Console,
     Force,
-    Linked,
     Output,
     Overwrite,
     Texts,
@@ -187,9 +187,10 @@ class Export(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Linked, Common):
+class View(Common):
     """Write a page that shows a map and localized queries in 3D; it works offline."""
 
+    allow_links_below: AllowedLinks = ()
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture folder: a map with points, or images with poses; or a COLMAP model."""
     result: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RESULT")] = None

@@ -8,11 +8,11 @@ from pathlib import Path
 import tyro
 
 from megloc_kapture.cli.common import (
+    AllowedLinks,
     Choosing,
     Console,
     Force,
     Input,
-    Linked,
     Output,
     Reading,
     Texts,
@@ -164,10 +164,11 @@ class Densify(Reading, Choosing, Working):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinePoses(Linked, Choosing, Working):
+class RefinePoses(Choosing, Working):
     """Refine the poses of localized queries; a refined pose that is no better is rejected, with
     the reason."""
 
+    allow_links_below: AllowedLinks = ()
     input: Input
     """Kapture map, with images and depth maps. Read only."""
     query: Path

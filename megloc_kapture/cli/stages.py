@@ -15,6 +15,7 @@ import tyro
 from pydantic import ValidationError
 
 from megloc_kapture.cli.common import (
+    AllowedLinks,
     Choosing,
     Computing,
     Console,
@@ -22,7 +23,6 @@ from megloc_kapture.cli.common import (
     Force,
     Input,
     Inputs,
-    Linked,
     Output,
     Overwrite,
     Reading,
@@ -81,9 +81,10 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractLocal(Linked, Choosing, Working):
+class ExtractLocal(Choosing, Working):
     """Extract local features of all images of kapture folders."""
 
+    allow_links_below: AllowedLinks = ()
     input: Inputs = ()
     """Kapture folder; may be repeated (map and queries)."""
     output: Output
@@ -401,9 +402,10 @@ def stage_command(name: str) -> type[Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preprocess(Linked, Computing, Working):
+class Preprocess(Computing, Working):
     """Resize, undistort and mask the images of a kapture folder; cameras are adapted."""
 
+    allow_links_below: AllowedLinks = ()
     input: Input
     """Kapture folder; not modified."""
     output: Output

@@ -10,12 +10,12 @@ from typing import Annotated, Literal
 import tyro
 
 from megloc_kapture.cli.common import (
+    AllowedLinks,
     Common,
     Console,
     Folders,
     Input,
     Inputs,
-    Linked,
     Output,
     Overwrite,
     Texts,
@@ -33,10 +33,11 @@ from megloc_kapture.values import RigidTransform
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Linked, Common):
+class Train(Common):
     """Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on
     photographs. Repeat the command to resume."""
 
+    allow_links_below: AllowedLinks = ()
     task: Annotated[
         tyro.conf.Positional[Literal["matcher", "descriptor"]], tyro.conf.arg(metavar="TASK")
     ]
@@ -89,10 +90,11 @@ _MIN_SHOWN = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainField(Linked, Common):
+class TrainField(Common):
     """Train a neural field (NeRF-W) on the images of a map, to render views and refine poses.
     Repeat the command to resume."""
 
+    allow_links_below: AllowedLinks = ()
     input: Input
     """Kapture map: images with poses, optionally masks and depth maps."""
     output: Output
@@ -159,9 +161,10 @@ class TrainField(Linked, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Linked, Working):
+class Render(Working):
     """Render views of a neural field: at a pose, along a result, or between map cameras."""
 
+    allow_links_below: AllowedLinks = ()
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
     """Folder that megloc train-field wrote."""
     output: Output
