@@ -1,4 +1,4 @@
-"""Flags shared by commands, with the names that kapture's tools use, and console output."""
+"""Flags shared by commands, with the names that kapture's tools use, and their messages."""
 
 from __future__ import annotations
 
@@ -58,48 +58,6 @@ Item = TypeVar("Item")
 _LINE_EVERY_S = 10.0
 
 
-class Console:
-    """Progress bars on a terminal, else plain lines; results go to standard output."""
-
-    def __init__(self, *, quiet: bool = False) -> None:
-        self.quiet = quiet
-        self.terminal = sys.stderr.isatty()
-
-    def say(self, text: str) -> None:
-        """Print a progress message to standard error."""
-        if not self.quiet:
-            print(text, file=sys.stderr, flush=True)
-
-    def result(self, text: str) -> None:
-        print(text, flush=True)
-
-    def counts(self, counts: Mapping[str, float]) -> None:
-        for words, figure in starmap(count_label, counts.items()):
-            self.result(f"{words:44s}{figure:>8}")
-
-    def track(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-        """Yield the items while showing the progress."""
-        if self.quiet:
-            yield from items
-        elif self.terminal:
-            from rich.console import Console as RichConsole
-            from rich.progress import MofNCompleteColumn, Progress
-
-            columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-            with Progress(*columns, console=RichConsole(stderr=True), transient=True) as progress:
-                yield from progress.track(items, total=total, description=f"  {label}")
-        else:
-            started = shown = time.monotonic()
-            for number, item in enumerate(items, start=1):
-                yield item
-                now = time.monotonic()
-                if now - shown > _LINE_EVERY_S and number < total:
-                    shown = now
-                    rate = number / (now - started)
-                    left = timedelta(seconds=round((total - number) / rate))
-                    self.say(f"  {label}: {number} of {total}, {rate:.2g}/s, {left} left")
-
-
 def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
     for folder in folders:
         reason = "is a file; a folder is needed" if folder.is_file() else "no such folder"
@@ -115,18 +73,9 @@ def kapture_map(path: Path) -> KaptureFolder:
     return KaptureFolder(map_of_workspace(path))
 
 
-def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:
-    """Return a map's kapture folder; a COLMAP model is imported into the user's cache."""
-    # importing the stages is slow
-    from megloc_kapture.datasets.colmap_map import is_colmap
-    from megloc_kapture.pipeline.map_making import kapture_of
-
-    if not is_colmap(path):
-        return kapture_of(path)
-    with open_executor("processes") as executor:
-        folder = kapture_of(path, work=Work(executor, console.track, force=force))
-    console.say(f"{path}: a COLMAP model, as kapture in {folder}")
-    return folder
+def print_counts(counts: Mapping[str, float]) -> None:
+    for words, figure in starmap(count_label, counts.items()):
+        print(f"{words:44s}{figure:>8}")
 
 
 def camera_of_text(text: str) -> Camera:
@@ -162,10 +111,49 @@ class Common:
     debug: bool = False
     """Show the traceback of an error."""
 
-    def console(self) -> Console:
+    def start_logging(self) -> None:
         level = "debug" if self.debug else self.verbose
         logging.basicConfig(level=getattr(logging, level.upper()), format=LOG_FORMAT)
-        return Console(quiet=self.quiet)
+
+    def say(self, text: str) -> None:
+        """Print a progress message to standard error; results are printed to standard output."""
+        if not self.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    def track(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+        """Yield the items while showing a progress bar on a terminal, else plain lines."""
+        if self.quiet:
+            yield from items
+        elif sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import MofNCompleteColumn, Progress
+
+            columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+            with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+                yield from progress.track(items, total=total, description=f"  {label}")
+        else:
+            started = shown = time.monotonic()
+            for number, item in enumerate(items, start=1):
+                yield item
+                now = time.monotonic()
+                if now - shown > _LINE_EVERY_S and number < total:
+                    shown = now
+                    rate = number / (now - started)
+                    left = timedelta(seconds=round((total - number) / rate))
+                    self.say(f"  {label}: {number} of {total}, {rate:.2g}/s, {left} left")
+
+    def opened_map(self, path: Path, *, force: bool = False) -> Path:
+        """Return a map's kapture folder; a COLMAP model is imported into the user's cache."""
+        # importing the stages is slow
+        from megloc_kapture.datasets.colmap_map import is_colmap
+        from megloc_kapture.pipeline.map_making import kapture_of
+
+        if not is_colmap(path):
+            return kapture_of(path)
+        with open_executor("processes") as executor:
+            folder = kapture_of(path, work=Work(executor, self.track, force=force))
+        self.say(f"{path}: a COLMAP model, as kapture in {folder}")
+        return folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +179,7 @@ class Working(Common):
         ):
             yield Work(
                 executor,
-                self.console().track,
+                self.track,
                 self.workers or available_cores(),
                 placement=self.placement(),
             )

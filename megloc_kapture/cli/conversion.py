@@ -11,13 +11,12 @@ import tyro
 from megloc_kapture.cli.common import (
     AllowedLinks,
     Common,
-    Console,
     Force,
     Output,
     Overwrite,
     Texts,
     Working,
-    opened_map,
+    print_counts,
 )
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
@@ -77,13 +76,13 @@ class Import(Common):
     """Write into a non-empty folder; for colmap: accept poses that contradict the matches of their
     images."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         name = self.dataset.removeprefix(TWIN_PREFIX)
         if name == COLMAP:
-            self._import_colmap(console)
+            self._import_colmap()
             return
         if name == MEGADEPTH:
-            self._import_megadepth(console)
+            self._import_megadepth()
             return
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
@@ -96,36 +95,36 @@ class Import(Common):
         inputs = (self.root,)
         with staged_output(self.output, kind=DATASET, force=self.force, inputs=inputs) as out:
             counts = choice.import_to(self.root, out)
-            work = Work(track=console.track)
+            work = Work(track=self.track)
             unreadable = set_aside_unreadable(out / QUERY, out / SIDE_TABLES, work)
             summary = out / SUMMARY_FILE
             text = summary.read_text(encoding="utf-8") if summary.is_file() else ""
-        console.counts(counts)
+        print_counts(counts)
         for name, reason in unreadable.items():
-            console.say(f"warning: query {name} cannot be used and will fail: {reason}")
+            self.say(f"warning: query {name} cannot be used and will fail: {reason}")
         if text:
-            console.result(text.rstrip())
+            print(text.rstrip())
 
-    def _import_colmap(self, console: Console) -> None:
+    def _import_colmap(self) -> None:
         source = find_colmap(self.root, images=self.images, database=self.database)
         with (
             staged_output(self.output, kind=MAP, force=self.force) as out,
             open_executor("processes") as executor,
         ):
-            work = Work(executor, console.track, force=self.force)
+            work = Work(executor, self.track, force=self.force)
             counts = import_colmap(source, out, unit=self.unit, work=work)
         for what, path in (("images", source.images), ("database", source.database)):
-            console.say(f"{what}: {path or 'none'}")
-        console.counts(counts)
+            self.say(f"{what}: {path or 'none'}")
+        print_counts(counts)
         if self.unit == NO_METRES:
-            console.say("unit: unknown scale; use --unit m if the map is in metres")
+            self.say("unit: unknown scale; use --unit m if the map is in metres")
 
-    def _import_megadepth(self, console: Console) -> None:
+    def _import_megadepth(self) -> None:
         options = options_with(MegaDepthOptions, self.set)
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
-            work = Work(track=console.track)
+            work = Work(track=self.track)
             counts = import_megadepth(self.root, out, options.scenes, work=work)
-        console.counts(counts)
+        print_counts(counts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,13 +142,13 @@ class Synth(Working):
     """An option of the world: key=value; may be repeated."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         changes = {"seed": self.seed, **assigned(self.set)}
         twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
         with self.staged(self.output, DATASET, force=self.force) as (out, work):
             counts = twin.write(out, work)
-        console.counts(counts)
-        console.result(f"rendered: {self.output}")
+        print_counts(counts)
+        print(f"rendered: {self.output}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +172,7 @@ class Export(Common):
     force: Overwrite = False
     """Overwrite, or write into a non-empty folder."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         number = export(
             self.format,
             self.output,
@@ -183,7 +182,7 @@ class Export(Common):
             undistort=self.undistort,
             force=self.force,
         )
-        console.result(f"{number} images exported: {self.output}")
+        print(f"{number} images exported: {self.output}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,17 +204,17 @@ class View(Common):
     force: Overwrite = False
     """Overwrite a file that is not a view."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         # slow import
         from megloc_kapture.evaluation.view import write_view
 
-        folder = KaptureFolder(opened_map(self.map, console))
+        folder = KaptureFolder(self.opened_map(self.map))
         left_out = write_view(self.output, folder, self.result, self.gt, force=self.force)
         if left_out:
-            console.say(left_out)
-        console.result(f"view: {self.output}")
+            self.say(left_out)
+        print(f"view: {self.output}")
         if self.open:
             import webbrowser
 
             if not webbrowser.open(self.output.resolve().as_uri()):
-                console.say("no browser could be started; open the file manually")
+                self.say("no browser could be started; open the file manually")

@@ -12,7 +12,6 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
-    Console,
     Force,
     Input,
     Inputs,
@@ -53,7 +52,7 @@ class Evaluate(Common):
     """Kapture folder of the map, for the report; if omitted, the workspace's."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         # slow import
         from megloc_kapture.evaluation.comparison import compare
         from megloc_kapture.evaluation.evaluate import (
@@ -88,7 +87,7 @@ class Evaluate(Common):
         if self.output is not None:
             with staged_output(self.output, kind=EVALUATION, force=self.force) as out:
                 write_report(out, reported)
-        console.result(report_text(reported))
+        print(report_text(reported))
 
     def _check(self) -> None:
         check_option(self.input, "no result given; use -i")
@@ -118,7 +117,7 @@ class Submit(Common):
     force: Overwrite = False
     """Overwrite the pose file and its JSON file."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         from megloc_kapture.io.dataset_tables import Protocol, read_protocol, tables_of
         from megloc_kapture.pipeline.submission import (
             check_dataset,
@@ -139,7 +138,7 @@ class Submit(Common):
             provenance={"dataset": self.dataset, **workspace_provenance(self.input)},
             from_rig=self.from_rig,
         )
-        console.result(f"{summary(counts)}: {self.output}")
+        print(f"{summary(counts)}: {self.output}")
 
     def _check_output(self, *, folder: bool) -> None:
         from megloc_kapture.evaluation.pose_files import provenance_path
@@ -188,7 +187,7 @@ class Check(Common):
     json: bool = False
     """Print the result as JSON."""
 
-    def run(self, console: Console) -> int:
+    def run(self) -> int:
         """Return 2 if there are problems."""
         from megloc_kapture.evaluation.check import check_submission, read_reference
         from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
@@ -197,7 +196,7 @@ class Check(Common):
 
         check_known(self.dataset)
         require(self.file.exists(), "no such file", path=self.file)
-        data = self.data or self._workspace(console)
+        data = self.data or self._workspace()
         reference = None if data is None else read_reference(data)
         if reference is not None and data is not None:
             tables = data / SIDE_TABLES
@@ -207,13 +206,13 @@ class Check(Common):
             self.file, dataset=self.dataset.removeprefix(TWIN_PREFIX), reference=reference
         )
         if self.json:
-            console.result(json.dumps(report.to_json(), indent=2, ensure_ascii=False))
+            print(json.dumps(report.to_json(), indent=2, ensure_ascii=False))
         else:
             for line in report.lines():
-                console.result(line)
+                print(line)
         return PROBLEMS_FOUND if report.has_problems else 0
 
-    def _workspace(self, console: Console) -> Path | None:
+    def _workspace(self) -> Path | None:
         from megloc_kapture.pipeline.datasets import dataset_names
 
         # runs/synthetic-aachen-classic, for example, is not a workspace of the dataset synthetic
@@ -225,9 +224,9 @@ class Check(Common):
             and not path.name.startswith(longer or "/")
         ]
         if len(workspaces) == 1:
-            console.say(f"compared with {workspaces[0]}")
+            self.say(f"compared with {workspaces[0]}")
             return workspaces[0]
         if workspaces:
             names = ", ".join(map(str, workspaces))
-            console.say(f"not compared: choose one of {names} with --data")
+            self.say(f"not compared: choose one of {names} with --data")
         return None

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Console, Deciding, Overwrite, Texts, Working
+from megloc_kapture.cli.common import Deciding, Overwrite, Texts, Working
 from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_TEXT, REPORT_HTML
@@ -71,7 +71,7 @@ class Eval(Deciding, Working):
     """Use a non-empty workspace, or that of another root; accept map poses that contradict the
     matches of their images."""
 
-    def run(self, console: Console) -> int:
+    def run(self) -> int:
         run = choose_run(
             self.dataset,
             self.root,
@@ -84,7 +84,7 @@ class Eval(Deciding, Working):
             find_root=not self.explain,
         )
         if self.explain:
-            console.result(explained(explain(run.options)))
+            print(explained(explain(run.options)))
             return 0
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
@@ -105,28 +105,28 @@ class Eval(Deciding, Working):
                 first=self.from_stage,
                 last=self.until,
                 dry_run=self.dry_run,
-                say=console.say,
+                say=self.say,
             )
         if self.dry_run:
             return 0
         if all_kept(reports):
-            console.say("nothing to do: every stage is up to date")
+            self.say("nothing to do: every stage is up to date")
         done = {report.name: report for report in reports}
-        status = self._conclude(console, workspace, run.benchmark) if "evaluation" in done else 0
+        status = self._conclude(workspace, run.benchmark) if "evaluation" in done else 0
         if "submission" in done:
             pose_file = run.submission_below(workspace.root, workspace.path(SIDE_TABLES))
-            self._hand_in(console, pose_file, submissions)
+            self._hand_in(pose_file, submissions)
             doubtful = done["submission"].counts.get("doubtful", 0)
             # only challenges, which have an adapter, have an evaluation server
             if doubtful and run.source.adapter is not None:
-                console.say(
+                self.say(
                     f"{doubtful:,} poses had too little confidence for the pose file; a server "
                     "counts a missing pose as wrong: --set localization.min_confidence=0 keeps "
                     "every pose"
                 )
         report = workspace.path(EVALUATION) / REPORT_HTML
         if "evaluation" in done and report.is_file():
-            console.result(f"report     {shown(report)}")
+            print(f"report     {shown(report)}")
         return status
 
     def _check_truth(self, choice: DatasetChoice) -> None:
@@ -140,37 +140,37 @@ class Eval(Deciding, Working):
             choice.has_truth(), f"--fail-below needs true poses: {choice.root}/query_gt is missing"
         )
 
-    def _hand_in(self, console: Console, pose_file: Path, submissions: Path | None) -> None:
+    def _hand_in(self, pose_file: Path, submissions: Path | None) -> None:
         if submissions is not None:
             kept = keep_submission(pose_file, submissions)
             if kept.name != pose_file.name:
-                console.say(
+                self.say(
                     f"{shown(submissions / pose_file.name)} belongs to another result and is kept"
                 )
             pose_file = kept
-        console.result(f"pose file  {shown(pose_file)}")
+        print(f"pose file  {shown(pose_file)}")
 
-    def _conclude(self, console: Console, workspace: Workspace, benchmark: BenchmarkFile) -> int:
+    def _conclude(self, workspace: Workspace, benchmark: BenchmarkFile) -> int:
         evaluation = workspace.path(EVALUATION)
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
-            console.say("warning: no query was localized; reasons are in localized/status.csv")
+            self.say("warning: no query was localized; reasons are in localized/status.csv")
         if misfits := misfits_text(statuses.values(), f"{LOCALIZED}/{STATUS_FILE}"):
-            console.say(misfits)
+            self.say(misfits)
         for text in (RECALL_TEXT, AGREEMENT_TEXT):
             if (evaluation / text).is_file():
-                console.result((evaluation / text).read_text(encoding="utf-8"))
+                print((evaluation / text).read_text(encoding="utf-8"))
                 break
         if benchmark.published:
-            console.result("published (percent, on the official data):")
+            print("published (percent, on the official data):")
         for text in benchmark.published:
-            console.result(f"  {text}")
+            print(f"  {text}")
         if self.fail_below is None:
             return 0
         recall = recall_rows(workspace.root)["all"]["recall"][-1]["recall"]
         if recall >= self.fail_below:
             return 0
-        console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
+        self.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
         return BELOW_RECALL
 
 

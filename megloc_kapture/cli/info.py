@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from megloc_kapture.cli.common import Common, Console, Reading, opened_map
+from megloc_kapture.cli.common import Common, Reading
 from megloc_kapture.cli.maps import report_lines
 from megloc_kapture.datasets.kapture_folders import cameras_of_folder
 from megloc_kapture.errors import MeglocError, OptionError
@@ -65,75 +65,75 @@ class Info(Reading, Common):
     deep: bool = False
     """Read every file, images included."""
 
-    def run(self, console: Console) -> None:
-        folder = self.kapture(opened_map(self.input, console))
-        describe_content(console, folder)
+    def run(self) -> None:
+        folder = self.kapture(self.opened_map(self.input))
+        describe_content(folder)
         folder.validate(deep=self.deep)
         if sizes := list(describe_sizes(folder)):
             for text in sizes:
-                line(console, "FAULT", text)
+                line("FAULT", text)
         else:
             checked = (
                 "all files and images: no fault found" if self.deep else "files: no fault found"
             )
-            line(console, "checked", checked)
+            line("checked", checked)
         if folder.has_points():
-            self._describe_map(console, folder.root)
+            self._describe_map(folder.root)
         else:
-            line(console, "localizing", "not possible: no points3d and observations")
+            line("localizing", "not possible: no points3d and observations")
 
-    def _describe_map(self, console: Console, root: Path) -> None:
+    def _describe_map(self, root: Path) -> None:
         try:
             opened = self.open_map(root, self.keypoints_type, self.pixel_origin)
         except MeglocError as error:
-            line(console, "localizing", f"not possible: {error}")
+            line("localizing", f"not possible: {error}")
             return
         unknown = "units of the map, of unknown scale"
-        line(console, "unit", "metres" if opened.unit == METRES else unknown)
+        line("unit", "metres" if opened.unit == METRES else unknown)
         if fault := opened.fault():
-            line(console, "FAULT", fault)
+            line("FAULT", fault)
         for local_type, keypoints in opened.keypoints.items():
             origin = keypoints.pixel_origin
             errors = ", ".join(f"{name} {value:.3f} px" for name, value in origin.error_px.items())
             extractor = keypoints.extractor()
-            line(console, "localizing with", local_type)
-            line(console, "pixel origin", f"{origin.intrinsics}: {origin.reason}")
-            line(console, "", f"median reprojection error by origin: {errors}")
-            line(console, "map descriptors", describe_descriptors(opened, keypoints, extractor))
-            line(console, "query features", describe_extraction(local_type, extractor))
-        describe_retrieval(console, opened)
+            line("localizing with", local_type)
+            line("pixel origin", f"{origin.intrinsics}: {origin.reason}")
+            line("", f"median reprojection error by origin: {errors}")
+            line("map descriptors", describe_descriptors(opened, keypoints, extractor))
+            line("query features", describe_extraction(local_type, extractor))
+        describe_retrieval(opened)
 
 
-def describe_content(console: Console, folder: KaptureFolder) -> None:
+def describe_content(folder: KaptureFolder) -> None:
     data = folder.read()
     # counts uncalibrated cameras too
     devices = (data.sensors[device] for _, device in data.records_camera)
     models = Counter("".join(sensor.params[:1]) or UNKNOWN_CAMERA for sensor in devices)
     cameras = ", ".join(f"{count} {model}" for model, count in sorted(models.items()))
-    line(console, "kapture", str(folder.root))
-    line(console, "sensors", f"{len(data.sensors)}, rigs {len(data.rigs)}")
+    line("kapture", str(folder.root))
+    line("sensors", f"{len(data.sensors)}, rigs {len(data.rigs)}")
     images = data.image_names()
-    line(console, "images", f"{len(images)} ({cameras}), {len(data.poses())} with a pose")
+    line("images", f"{len(images)} ({cameras}), {len(data.poses())} with a pose")
     if missing := [image for image in images if not folder.image_path(image).is_file()]:
-        line(console, "missing files", f"{len(missing)} of the images, such as {missing[0]}")
+        line("missing files", f"{len(missing)} of the images, such as {missing[0]}")
     if data.records_depth:
         joined = len(depth_records(data))
         # a depth map belongs to an image if a rig links their sensors
         use = "" if joined else ": ignored, as no rig links their sensor to a camera"
-        line(console, "depth maps", f"{len(data.records_depth)}, of {joined} images{use}")
+        line("depth maps", f"{len(data.records_depth)}, of {joined} images{use}")
     for kind in ARRAY_KINDS:
         for name in folder.types(kind):
             reader = folder.features(kind, name)
             stored = f"{reader.config.dtype.name} x {reader.config.dsize}"
             text = f"{name}: {len(reader.names)} images, {stored}"
-            line(console, kind.replace("_", " "), text)
+            line(kind.replace("_", " "), text)
     for name in folder.types("matches"):
-        line(console, "matches", f"{name}: {len(folder.matches(name).pairs)} pairs")
+        line("matches", f"{name}: {len(folder.matches(name).pairs)} pairs")
     if folder.has_points():
-        line(console, "points", str(len(folder.points3d())))
+        line("points", str(len(folder.points3d())))
         for name, seen in sorted(folder.observations().items()):
-            line(console, "observations", f"{name}: {len(seen.point_ids)}")
-        describe_refinement(console, folder)
+            line("observations", f"{name}: {len(seen.point_ids)}")
+        describe_refinement(folder)
 
 
 def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
@@ -149,19 +149,19 @@ def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
         yield f"{len(errors)} images differ in size from their cameras, the first: {errors[0]}"
 
 
-def describe_refinement(console: Console, folder: KaptureFolder) -> None:
+def describe_refinement(folder: KaptureFolder) -> None:
     for row, text in enumerate(report_lines(folder.root)):
-        line(console, "" if row else "refinement", text)
+        line("" if row else "refinement", text)
     covariances = read_point_covariances(folder.root, len(folder.points3d()))
     if covariances is None:
         return
     largest = point_deviations(covariances)[:, 2]
     known = largest[np.isfinite(largest)]
-    line(console, "uncertainty", f"known for {len(known)} points")
+    line("uncertainty", f"known for {len(known)} points")
     if len(known):
         at = np.quantile(known, _QUANTILES)
         text = ", ".join(f"{100 * q:g} %: {d:.3g}" for q, d in zip(_QUANTILES, at, strict=True))
-        line(console, "", f"largest standard deviation for 1 px of noise, percentiles: {text}")
+        line("", f"largest standard deviation for 1 px of noise, percentiles: {text}")
 
 
 def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
@@ -187,23 +187,23 @@ def describe_descriptors(
     return f"missing; will be extracted again by plugin {extractor.name}"
 
 
-def describe_retrieval(console: Console, opened: KaptureMap) -> None:
+def describe_retrieval(opened: KaptureMap) -> None:
     for keypoints in opened.keypoints.values():
         missing = not keypoints.has_descriptors(opened.images)
         if missing and not (keypoints.extractor() and opened.has_images()):
-            line(console, "retrieval", "not possible without the map's descriptors")
+            line("retrieval", "not possible without the map's descriptors")
             return
     options = options_of_preset(DEFAULT_PRESET)
     types = local_types_of(opened, options)
     retrieval = MapMatching(opened, options, types)
-    line(console, "retrieval", retrieval.describe_candidates(()))
+    line("retrieval", retrieval.describe_candidates(()))
     if brought := opened.global_types:
         text = retrieval.describe_candidates(brought)
-        line(console, "", f"if queries have {', '.join(brought)}: {text}")
+        line("", f"if queries have {', '.join(brought)}: {text}")
 
 
-def line(console: Console, name: str, text: str) -> None:
-    console.result(f"{name:{_COLUMN}s}{text}")
+def line(name: str, text: str) -> None:
+    print(f"{name:{_COLUMN}s}{text}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +217,7 @@ class OptionsCommand(Common):
     basic: bool = False
     """Show only the ten options that are changed most often."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         every = list(options_of(options_of_preset(self.preset)))
         if self.basic:
             every = [option for option in every if option.key in BASIC_OPTIONS]
@@ -233,8 +233,8 @@ class OptionsCommand(Common):
                 f"no option, step or plugin {self.key!r}; {hint}`megloc options` lists all options"
             )
         for option in selected:
-            console.result(f"{option.key} = {shown(option.value)}")
-            console.result(f"    {option.kind}{f'; {option.meaning}' if option.meaning else ''}")
+            print(f"{option.key} = {shown(option.value)}")
+            print(f"    {option.kind}{f'; {option.meaning}' if option.meaning else ''}")
 
 
 def shown(value: Any) -> str:

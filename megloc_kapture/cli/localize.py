@@ -15,7 +15,6 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
-    Console,
     Deciding,
     Input,
     Output,
@@ -23,7 +22,6 @@ from megloc_kapture.cli.common import (
     Reading,
     Texts,
     cameras_of_text,
-    opened_map,
 )
 from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.errors import OptionError, check_option, require
@@ -77,24 +75,24 @@ class Localize(Reading, Deciding, Common):
     force: Overwrite = False
     """Write into a non-empty folder, and localize in an inconsistent map."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
         folder: KaptureFolder | Photographs
         if self.query is None:
             folder = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
             for text in folder.describe():
-                console.say(text)
+                self.say(text)
         else:
             folder = self.kapture(self.query)
-        path = opened_map(self.input, console, force=self.force)
+        path = self.opened_map(self.input, force=self.force)
         kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
         _check_consistent(kapture_map, self.input, force=self.force)
         options = self.options()
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
         # fail before the first query and before anything is written
         localizer = Localizer(kapture_map, options=options)
-        results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
+        results = Results(localizer, folder, workers=workers, candidates=given, track=self.track)
         queries = results.queries
         if given is not None:
             names, images = set(queries.names), set(kapture_map.images)
@@ -113,24 +111,24 @@ class Localize(Reading, Deciding, Common):
         how = "as given"
         if given is None:
             how = localizer.matching.describe_candidates(queries.types_of_all())
-        console.say(f"localizing with {', '.join(local.name for local in localizer.types)}")
-        console.say(f"candidates: {how}")
-        console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
+        self.say(f"localizing with {', '.join(local.name for local in localizer.types)}")
+        self.say(f"candidates: {how}")
+        self.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
         remarks = Counter(remark for _, result in named for remark in result.remarks)
         focal = {remark for remark in remarks if "focal length" in remark}
         for remark in sorted(remarks.keys() - focal):
-            console.say(f"skipped for {remarks[remark]} queries: {remark}")
+            self.say(f"skipped for {remarks[remark]} queries: {remark}")
         if kapture_map.unit != METRES:
-            console.say("positions are in units of the map, of unknown scale")
+            self.say("positions are in units of the map, of unknown scale")
         if misfits := misfits_text(results.values(), STATUS_FILE):
-            console.say(misfits)
-        console.result(
+            self.say(misfits)
+        print(
             f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s; "
             f"poses and status.csv in {self.output}"
             + (f", {counts['fallbacks']} fallback poses" if counts["fallbacks"] else "")
         )
         if counts["queries"] and not counts["localized"]:
-            console.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
+            self.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
 
     def _check_queries(self) -> None:
         if (self.query is None) == (not self.images):
@@ -171,7 +169,7 @@ class Serve(Reading, Deciding, Common):
     force: Overwrite = False
     """Localize in an inconsistent map."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         from megloc_kapture.service.app import Service
         from megloc_kapture.service.server import bind, prepared_localizer, serve
 
@@ -191,19 +189,19 @@ class Serve(Reading, Deciding, Common):
             )
         options = self.options()
         with bind(self.host, self.port) as bound:
-            path = opened_map(self.map, console, force=self.force)
+            path = self.opened_map(self.map, force=self.force)
             kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
             _check_consistent(kapture_map, self.map, force=self.force)
             localizer = prepared_localizer(kapture_map, options)
             host = f"[{self.host}]" if ":" in self.host else self.host
             where = f"http://{host}:{bound.getsockname()[1]}/"
-            console.result(f"{len(kapture_map.images)} map images, served at {where}")
+            print(f"{len(kapture_map.images)} map images, served at {where}")
             log_requests = logging.getLogger().isEnabledFor(logging.INFO)
             service = Service(localizer, **limits, token=token)
             try:
                 serve(service, bound, log_requests=log_requests)
             except KeyboardInterrupt:
-                console.say("stopped")
+                self.say("stopped")
                 sys.exit(128 + signal.SIGINT)
 
 

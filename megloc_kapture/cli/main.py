@@ -14,6 +14,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -127,11 +128,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(DONE)
         import tyro
 
+        if isinstance(sys.stdout, TextIOWrapper):  # results appear at once, also in a pipe
+            sys.stdout.reconfigure(line_buffering=True)
         command = tyro.cli(
             _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
         )
+        command = getattr(command, "action", command)  # of `megloc weights`
         debug = command.debug
-        status = command.run(command.console()) or DONE
+        command.start_logging()
+        status = command.run() or DONE
         sys.stdout.flush()
     except KeyboardInterrupt:
         _say_stopped("interrupted")

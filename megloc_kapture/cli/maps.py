@@ -10,7 +10,6 @@ import tyro
 from megloc_kapture.cli.common import (
     AllowedLinks,
     Choosing,
-    Console,
     Force,
     Input,
     Output,
@@ -66,19 +65,19 @@ class MapPhotographs(Choosing, Working):
     """Use every N-th frame of videos; if omitted, 30."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         options = options_of_photographs(self.preset or DEFAULT_PRESET, self.assignments())
         photographs = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
         for text in photographs.describe():
-            console.say(text)
+            self.say(text)
         known = photographs.known_cameras()
         structure = structure_options(photographs, self.mapper, self.scale, known_cameras=known)
         stages = plan_photographs(photographs, options, structure)
         workspace = Workspace(self.output, force=self.force)
         with self.working_in(workspace) as work:
-            run_plan(stages, workspace, work, say=console.say)
+            run_plan(stages, workspace, work, say=self.say)
         for line in describe_map(self.output, photographs):
-            console.result(line)
+            print(line)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +94,7 @@ class RefineMap(Reading, Choosing, Working):
     """Kapture folder of the refined map."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         options = self.options().refinement
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
@@ -104,7 +103,7 @@ class RefineMap(Reading, Choosing, Working):
             )
             keep_unit(source.root, out)
         for row in report_lines(self.output):
-            console.say(row)
+            self.say(row)
 
 
 def report_lines(root: Path) -> list[str]:
@@ -145,7 +144,7 @@ class Densify(Reading, Choosing, Working):
     """Write the fused point cloud to this PLY file."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         chosen: dict[str, object] = {"mode": "points" if self.points else "depth"}
         if self.by is not None:
             chosen["estimator"] = {"name": self.by}
@@ -156,11 +155,11 @@ class Densify(Reading, Choosing, Working):
                 source, out, options, restrictions=restrictions_beside(source.root), work=work
             )
             keep_unit(source.root, out)
-            console.say(counts_text(counts))
+            self.say(counts_text(counts))
             if self.fuse is not None:
                 tolerance_px = fitted_to_poses(source, options.max_size_px).tolerance_px
                 fused = fuse_depth(KaptureFolder(out), self.fuse, tolerance_px, work=work)
-                console.say(f"{fused} points in {self.fuse}")
+                self.say(f"{fused} points in {self.fuse}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +181,7 @@ class RefinePoses(Choosing, Working):
     the preset's."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         changes: dict[str, object] = {"pose_refinement": {"by": list(self.by)}} if self.by else {}
         options = self.options(changes).pose_refinement
         if self.by:  # in the order of --by, with options from --set
@@ -200,7 +199,7 @@ class RefinePoses(Choosing, Working):
                 restrictions=restrictions_beside(self.query),
                 work=work,
             )
-        console.result(f"{counts_text(counts)}; status.csv and refinement.csv in {self.output}")
+        print(f"{counts_text(counts)}; status.csv and refinement.csv in {self.output}")
         if (table := self.output / CONSISTENCY_FILE).is_file():
             for row in read_consistency(table):
-                console.result(consistency_sentence(row))
+                print(consistency_sentence(row))

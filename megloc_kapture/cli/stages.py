@@ -18,7 +18,6 @@ from megloc_kapture.cli.common import (
     AllowedLinks,
     Choosing,
     Computing,
-    Console,
     Folders,
     Force,
     Input,
@@ -93,7 +92,7 @@ class ExtractLocal(Choosing, Working):
     """Extractor plugins; if omitted, the preset's."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         check_option(self.input, "no kapture folder given; use -i")
         folders = [kapture_map(path) for path in self.input]
         options = self.options(_named(self.preset, "local_features", self.features))
@@ -103,7 +102,7 @@ class ExtractLocal(Choosing, Working):
                 counts = extract_local_features(
                     folders, extractor, out, mask_margin_px=options.mask_margin_px, work=work
                 )
-                console.say(f"{extractor.name}: {counts_text(counts)}")
+                self.say(f"{extractor.name}: {counts_text(counts)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +125,7 @@ class Match(Reading, Choosing, Working):
     force: Overwrite = False
     """Write into a non-empty folder, and accept poses that contradict the matches."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         mapping = self.kapture_map(self.input)
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
@@ -145,7 +144,7 @@ class Match(Reading, Choosing, Working):
             counts = match_pairs(
                 first, mapping, pairs, local_type, matcher, verification, out, work=work
             )
-        console.say(f"{counts['matches']} matches in {counts['pairs_with_matches']} pairs")
+        self.say(f"{counts['matches']} matches in {counts['pairs_with_matches']} pairs")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +161,7 @@ class Triangulate(Reading, Choosing, Working):
     """Types of local features, each with separate points; required if several exist."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         mapping = self.kapture_map(self.input)
         local_types = [only_type(mapping, "matches", asked) for asked in self.features or (None,)]
         pairs = None if self.pairs is None else _read_pairs_of(self.pairs, mapping, mapping)
@@ -176,7 +175,7 @@ class Triangulate(Reading, Choosing, Working):
                 num_threads=work.num_threads,
             )
             keep_unit(mapping.root, out)
-        console.say(counts_text(counts))
+        self.say(counts_text(counts))
 
 
 def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> list[ImagePair]:
@@ -205,7 +204,7 @@ class ExtractGlobal(Reading, Choosing, Working):
     """Local features that VLAD aggregates; required if several types exist."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         options = self.options(_named(self.preset, "global_features", self.features))
         folders = [self.kapture_map(self.input), *map(self.kapture, self.query)]
         extractors = {
@@ -225,7 +224,7 @@ class ExtractGlobal(Reading, Choosing, Working):
                     extractor = extractors[choice.name]
                     type_name = extractor.name
                     counts = extract_global_features(folders, extractor, out, work=work)
-                console.say(f"{type_name}: {counts['images']} images")
+                self.say(f"{type_name}: {counts['images']} images")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,7 +248,7 @@ class PairsMapping(Reading, Choosing, Working):
     force: Overwrite = False
     """Overwrite the pairs file."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         mapping = self.kapture_map(self.input)
         chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
@@ -269,7 +268,7 @@ class PairsMapping(Reading, Choosing, Working):
             )
         _refuse_existing(self.output, force=self.force)
         write_pairs(self.output, pairs)
-        console.say(f"{len(pairs)} pairs")
+        self.say(f"{len(pairs)} pairs")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,7 +302,7 @@ class PairsQuery(Reading, Choosing, Working):
     force: Overwrite = False
     """Overwrite the pairs file and the folder of matches."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         if (self.rerank is None) != (self.matches_dir is None):
             raise OptionError("--rerank N needs --matches-dir DIR for its matches, and vice versa")
         _refuse_existing(self.output, force=self.force)
@@ -338,7 +337,7 @@ class PairsQuery(Reading, Choosing, Working):
                 pairs = reranked(pairs, matched, out, local_types, how)
         _refuse_existing(self.output, force=self.force)
         write_pairs(self.output, pairs)
-        console.say(f"{len(pairs)} pairs")
+        self.say(f"{len(pairs)} pairs")
 
     def _types_of_both(self, mapping: KaptureFolder, query: KaptureFolder) -> list[str]:
         both = set(mapping.types("descriptors")) & set(query.types("descriptors"))
@@ -382,7 +381,7 @@ class OutsideStage(Working):
     set: Texts = ()
     """Change an option of the stage: key=value; may be repeated."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         stage = load_plugin(STAGES, self.stage, assigned(self.set))
         check_option(
             (self.workspace / "stages").is_dir(),
@@ -390,7 +389,7 @@ class OutsideStage(Working):
         )
         workspace = Workspace(self.workspace)
         with self.working_in(workspace) as work:
-            run_plan([stage], workspace, work, say=console.say)
+            run_plan([stage], workspace, work, say=self.say)
 
 
 def stage_command(name: str) -> type[Any]:
@@ -434,18 +433,18 @@ class Preprocess(Computing, Working):
     """Change another option: key=value (upscale); may be repeated."""
     force: Force = False
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         options = self.options()
         source = kapture_map(self.input)
         sequences = [KaptureFolder(path) for path in existing(self.sequence)]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             counts = preprocess_images(source, out, options, sequences=sequences, work=work)
             keep_unit(source.root, out)
-        console.say(f"{counts['images']} images, {counts['images_changed']} of them changed")
+        self.say(f"{counts['images']} images, {counts['images_changed']} of them changed")
         for name, share in counts.items():
             if name.startswith("masked_"):
                 source_of_masks = name.removeprefix("masked_")
-                console.say(f"masked ({source_of_masks}): {100 * share:.2f} % of all pixels")
+                self.say(f"masked ({source_of_masks}): {100 * share:.2f} % of all pixels")
 
     def options(self) -> PreprocessingOptions:
         masks: dict[str, Any] = {

@@ -12,7 +12,6 @@ import tyro
 from megloc_kapture.cli.common import (
     AllowedLinks,
     Common,
-    Console,
     Folders,
     Input,
     Inputs,
@@ -60,7 +59,7 @@ class Train(Common):
     force: Overwrite = False
     """Overwrite the files of another training."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         # slow import
         from megloc_kapture.pipeline.presets import options_with
         from megloc_kapture.training.train import TASKS, train
@@ -75,12 +74,12 @@ class Train(Common):
             held_out=[KaptureFolder(path) for path in self.held_out],
             force=self.force,
             threads=self.threads,
-            work=Work(track=console.track),
+            work=Work(track=self.track),
         )
         for name, value in last.items():
             if value == value:
-                console.result(f"{name.replace('_', ' '):20s}{value:>12.6g}")
-        console.result(f"trained: {self.output}")
+                print(f"{name.replace('_', ' '):20s}{value:>12.6g}")
+        print(f"trained: {self.output}")
 
 
 FIELD = "field"
@@ -122,7 +121,7 @@ class TrainField(Common):
     force: Overwrite = False
     """Write into a non-empty folder; start the training again."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         from pydantic import ValidationError
 
         from megloc_kapture.io.files import first_problem, remove
@@ -140,7 +139,7 @@ class TrainField(Common):
 
         def progress(step: int, seconds: float, psnr_db: list[float]) -> None:
             held_out = ", ".join(f"{value:.1f}" for value in psnr_db)
-            console.say(
+            self.say(
                 f"  step {step} of {self.steps}, {seconds:.0f} s"
                 + (f", held-out images {held_out} dB" if held_out else "")
             )
@@ -157,7 +156,7 @@ class TrainField(Common):
                 release_folder(self.output)
             raise
         mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"
-        console.result(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")
+        print(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +188,7 @@ class Render(Working):
     force: Overwrite = False
     """Overwrite a file, or write into a non-empty folder."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         from megloc_kapture.stages.neural_field import render_along, views_between
 
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
@@ -197,7 +196,7 @@ class Render(Working):
         many = self.along or self.between
         if many is None:
             self._render_one()
-            console.result(f"rendered: {self.output}")
+            print(f"rendered: {self.output}")
             return
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
@@ -213,7 +212,7 @@ class Render(Working):
                 min_shown=0.0 if self.between is None else _MIN_SHOWN,
                 work=work,
             )
-        console.result(f"{count} views rendered: {self.output}")
+        print(f"{count} views rendered: {self.output}")
 
     def _render_one(self) -> None:
         import cv2

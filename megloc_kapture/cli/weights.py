@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Console, Output, Overwrite
+from megloc_kapture.cli.common import Common, Output, Overwrite
 from megloc_kapture.errors import (
     DataError,
     MeglocError,
@@ -47,16 +47,16 @@ WRONG_FILES = 2
 class List(Common):
     """List all networks with the file, size, licence and state of their weights."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         import pandas as pd  # slow import
 
-        console.result(as_text(pd.DataFrame([_row(weights) for weights in registry().values()])))
-        console.result(f"\nfolder of weights: {weights_folder()}")
-        console.result("(!) megloc weights fetch asks for consent: --accept-licence")
-        console.result("* facts that are not confirmed on the original file:")
+        print(as_text(pd.DataFrame([_row(weights) for weights in registry().values()])))
+        print(f"\nfolder of weights: {weights_folder()}")
+        print("(!) megloc weights fetch asks for consent: --accept-licence")
+        print("* facts that are not confirmed on the original file:")
         for weights in registry().values():
             if weights.unverified:
-                console.result(f"  {weights.name}: {weights.unverified}")
+                print(f"  {weights.name}: {weights.unverified}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,12 +72,12 @@ class Fetch(Common):
     force: Overwrite = False
     """Replace an existing, different file."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         names = self.names
         if self.preset is not None:
             names = tuple(dict.fromkeys((*names, *_missing(self.preset))))
             if not names:
-                console.result(f"{self.preset}: no weights are missing")
+                print(f"{self.preset}: no weights are missing")
         elif not names:
             raise OptionError(f"choose weights to fetch: {', '.join(registry())}")
         wanted, refused = [], []
@@ -89,22 +89,22 @@ class Fetch(Common):
                     raise
                 refused.append(str(error))
         for weights, file, url in wanted:
-            self._fetch(console, weights, file, url)
+            self._fetch(weights, file, url)
         if refused:
             raise MissingWeightsError("\n".join(refused))
 
-    def _fetch(self, console: Console, weights: Weights, file: PublishedFile, url: str) -> None:
+    def _fetch(self, weights: Weights, file: PublishedFile, url: str) -> None:
         place = weights_folder() / file.name
         if place.is_file() and not self.force:
             if file.sha256 in (None, sha256_of(describe(weights.name, place))):
-                console.result(f"{weights.name}: already present, {place}")
-                _say_to_convert(console, weights, file, place)
+                print(f"{weights.name}: already present, {place}")
+                _say_to_convert(weights, file, place)
                 return
             raise OutputError(f"{place}: exists, but is not the published file; -f replaces it")
 
-        console.say(f"{weights.name}: {url}")
-        console.say(f"  licence: {weights.licence}: {weights.terms}")
-        fetch(url, place, sha256=file.sha256, track=console.track)
+        self.say(f"{weights.name}: {url}")
+        self.say(f"  licence: {weights.licence}: {weights.terms}")
+        fetch(url, place, sha256=file.sha256, track=self.track)
         state = "sha256 correct"
         if file.sha256 is None:
             downloaded = describe(weights.name, place)
@@ -115,8 +115,8 @@ class Fetch(Common):
                 except DataError:
                     place.unlink()
                     raise
-        console.result(f"{weights.name}: {place} ({place.stat().st_size} bytes, {state})")
-        _say_to_convert(console, weights, file, place)
+        print(f"{weights.name}: {place} ({place.stat().st_size} bytes, {state})")
+        _say_to_convert(weights, file, place)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,9 +132,9 @@ class Add(Common):
     force: Overwrite = False
     """Replace an existing, different file."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         added = add_weights(self.file, name=self.name, force=self.force, unverified=self.unverified)
-        console.result(f"{added.name}: {added.path} ({_trust(added)})")
+        print(f"{added.name}: {added.path} ({_trust(added)})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,9 +148,9 @@ class Convert(Common):
     force: Overwrite = False
     """Overwrite an existing file."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         count = convert_weights(self.file, self.output, force=self.force)
-        console.result(f"{self.output}: {count} tensors")
+        print(f"{self.output}: {count} tensors")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,12 +160,12 @@ class Check(Common):
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
     """Names of networks, as listed; if omitted, all networks that have a file."""
 
-    def run(self, console: Console) -> int:
+    def run(self) -> int:
         """Return 2 if a file is wrong."""
-        wrong = sum(_wrong(console, lookup(name)) for name in self.names)
+        wrong = sum(_wrong(lookup(name)) for name in self.names)
         if not self.names:
-            wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) == "present")
-        console.result(f"wrong files: {wrong}" if wrong else "all files are correct")
+            wrong = sum(_wrong(w) for w in registry().values() if _state(w) == "present")
+        print(f"wrong files: {wrong}" if wrong else "all files are correct")
         return WRONG_FILES if wrong else 0
 
 
@@ -180,16 +180,6 @@ class WeightsCommand:
         | Annotated[Convert, tyro.conf.subcommand("convert", description=Convert.__doc__)]
         | Annotated[Check, tyro.conf.subcommand("check", description=Check.__doc__)]
     )
-
-    @property
-    def debug(self) -> bool:
-        return self.action.debug
-
-    def console(self) -> Console:
-        return self.action.console()
-
-    def run(self, console: Console) -> int | None:
-        return self.action.run(console)
 
 
 def summary() -> str:
@@ -206,9 +196,9 @@ def _missing(preset: str) -> tuple[str, ...]:
     return ()
 
 
-def _say_to_convert(console: Console, weights: Weights, file: PublishedFile, place: Path) -> None:
+def _say_to_convert(weights: Weights, file: PublishedFile, place: Path) -> None:
     if file.convert and next(files_of(weights), None) is None:
-        console.result(f"{weights.name}: convert it once: {how_to_convert(weights, place)}")
+        print(f"{weights.name}: convert it once: {how_to_convert(weights, place)}")
 
 
 def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile, str]:
@@ -226,21 +216,21 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
     return weights, file, file.url
 
 
-def _wrong(console: Console, weights: Weights) -> int:
+def _wrong(weights: Weights) -> int:
     """Print the state of each file of a network; return the number of wrong files."""
     wrong = 0
     paths = list(files_of(weights))
     if not paths:
-        console.result(f"wrong: {how_to_get(weights)}")
+        print(f"wrong: {how_to_get(weights)}")
         return 1
     for path in paths:
         file = describe(weights.name, path)
         try:
             read_weights(file)
-            console.result(f"{weights.name}: {path} ({_trust(file)})")
+            print(f"{weights.name}: {path} ({_trust(file)})")
         except MeglocError as error:
             wrong += 1
-            console.result(f"wrong: {error}")
+            print(f"wrong: {error}")
     return wrong
 
 
@@ -276,18 +266,18 @@ def _row(weights: Weights) -> dict[str, str]:
 class Doctor(Common):
     """Check the environment: versions, incompatible packages, GPU, weights."""
 
-    def run(self, console: Console) -> None:
+    def run(self) -> None:
         """Print the environment and exit with 2 if something is wrong."""
         for package in (*PACKAGES, "kapture", "numba"):
-            console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
-        console.result(f"{'GPU':24s}{gpu()}")
-        console.result(f"{'weights':24s}{summary()}")
+            print(f"{package:24s}{installed_version(package) or 'not installed'}")
+        print(f"{'GPU':24s}{gpu()}")
+        print(f"{'weights':24s}{summary()}")
         problems = find_problems()
         for problem in problems:
-            console.result(f"problem: {problem}")
+            print(f"problem: {problem}")
         if problems:
             raise MeglocError(f"{len(problems)} problems found, see above")
-        console.result("no problem found")
+        print("no problem found")
 
 
 def gpu() -> str:
