@@ -44,7 +44,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
     }
     with dask.config.set(settings), ExitStack() as stack:
         client = _client(stack, workers, scheduler)
-        threads = sum(worker["nthreads"] for worker in _workers(client))
+        threads = sum(client.nthreads().values())
         check_option(threads, f"the scheduler {scheduler} has no workers: start some (dask worker)")
         try:
             client.get_versions(check=True, packages=_PACKAGES)
@@ -88,10 +88,6 @@ def _client(stack: ExitStack, workers: int, scheduler: str | None) -> Client:
         silence_logs=logging.CRITICAL,
     )
     return stack.enter_context(Client(stack.enter_context(cluster), set_as_default=False))
-
-
-def _workers(client: Client) -> list[dict[str, Any]]:
-    return list(client.scheduler_info(n_workers=-1)["workers"].values())
 
 
 @dataclass
