@@ -42,7 +42,6 @@ from megloc_kapture.pipeline.map_making import (
     options_of_photographs,
     plan_map,
     plan_photographs,
-    structure_options,
 )
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset, options_with
@@ -323,11 +322,9 @@ def map_photographs(
     options = options_of_photographs(preset, set or {})
     photographs = Photographs(paths, camera)
     asked = () if scale is None else (scale,) if scale == "gps" else tuple(map(str, scale))
-    known = photographs.known_cameras()
-    structure = structure_options(photographs, mapper, asked, known_cameras=known)
     title = Path(paths[0]).resolve().stem
     place = workspace or Path("runs") / f"{title}-{preset}"
-    stages = plan_photographs(photographs, options, structure)
+    stages = plan_photographs(photographs, options, mapper, asked)
     made = _run(stages, place, workers, scheduler)
     return Map(KaptureMap.open(made.path(MAP)), options)
 

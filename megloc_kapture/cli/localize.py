@@ -81,7 +81,7 @@ class Localize(Reading, Deciding, Common):
         folder: KaptureFolder | Photographs
         if self.query is None:
             folder = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
-            for text in folder.describe():
+            if text := folder.describe():
                 self.say(text)
         else:
             folder = self.kapture(self.query)

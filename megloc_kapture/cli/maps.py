@@ -31,7 +31,6 @@ from megloc_kapture.pipeline.map_making import (
     describe_map,
     options_of_photographs,
     plan_photographs,
-    structure_options,
 )
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET
@@ -68,11 +67,9 @@ class MapPhotographs(Choosing, Working):
     def run(self) -> None:
         options = options_of_photographs(self.preset or DEFAULT_PRESET, self.assignments())
         photographs = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
-        for text in photographs.describe():
+        if text := photographs.describe():
             self.say(text)
-        known = photographs.known_cameras()
-        structure = structure_options(photographs, self.mapper, self.scale, known_cameras=known)
-        stages = plan_photographs(photographs, options, structure)
+        stages = plan_photographs(photographs, options, self.mapper, self.scale)
         workspace = Workspace(self.output, force=self.force)
         with self.working_in(workspace) as work:
             run_plan(stages, workspace, work, say=self.say)

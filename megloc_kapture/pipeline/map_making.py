@@ -80,31 +80,15 @@ from megloc_kapture.values import Options
 
 _log = logging.getLogger(__name__)
 
-# each runs only if the options request it
-MAP_STAGES: tuple[type[PipelineStage], ...] = (
-    Preprocess,
-    ExtractLocalFeatures,
-    ExtractGlobalFeatures,
-    PairMapping,
-    MatchMapping,
-    PyramidMapping,
-    MakePoints,
-    RefineMap,
-    Densify,
-)
+# each stage runs only if the options request it
 _WITHOUT_POSES: tuple[type[PipelineStage], ...] = (
     Preprocess,
     ExtractLocalFeatures,
     ExtractGlobalFeatures,
     PairMapping,
-    MatchPhotographs,
 )
-_WITH_POSES: tuple[type[PipelineStage], ...] = (
-    MatchMapping,
-    PyramidMapping,
-    MakePoints,
-    RefineMap,
-)
+_WITH_POSES: tuple[type[PipelineStage], ...] = (MatchMapping, PyramidMapping, MakePoints, RefineMap)
+MAP_STAGES: tuple[type[PipelineStage], ...] = (*_WITHOUT_POSES, *_WITH_POSES, Densify)
 
 
 def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
@@ -205,10 +189,9 @@ def options_of_photographs(
     return options
 
 
-def structure_options(
-    photographs: Photographs, mapper: Mapper, scale: Sequence[str], *, known_cameras: bool
+def _structure_options(
+    photographs: Photographs, mapper: Mapper, scale: Sequence[str]
 ) -> StructureOptions:
-    """Return reconstruction options; ``scale`` is empty, ``gps``, or two photographs and metres."""
     gps, distance = None, None
     if tuple(scale) == (GPS,):
         gps = photographs.gps()
@@ -233,18 +216,24 @@ def structure_options(
             f"--scale takes {GPS}, or two photographs and the metres between them, got "
             f"{' '.join(scale)!r}"
         )
-    return StructureOptions(mapper=mapper, known_cameras=known_cameras, distance=distance, gps=gps)
+    known = photographs.known_cameras()
+    return StructureOptions(mapper=mapper, known_cameras=known, distance=distance, gps=gps)
 
 
 def plan_photographs(
-    photographs: Photographs, options: PipelineOptions, structure: StructureOptions
+    photographs: Photographs, options: PipelineOptions, mapper: Mapper, scale: Sequence[str] = ()
 ) -> list[Stage]:
+    """Return the stages that map photographs.
+
+    ``scale`` is empty, ``gps``, or two photographs and the metres between their cameras.
+    """
+    structure = _structure_options(photographs, mapper, scale)
     check_weights(options)
     options.retrieval()
     if len(photographs.names) < MIN_IMAGES:
         raise _too_few(len(photographs.names), photographs.unreadable)
     stages: list[Stage] = [ImportPhotographs(photographs)]
-    stages += wanted_stages(_WITHOUT_POSES, options)
+    stages += wanted_stages((*_WITHOUT_POSES, MatchPhotographs), options)
     stages.append(FindPoses(options, structure))
     with_poses = wanted_stages(_WITH_POSES, options)
     for stage in with_poses:

@@ -369,13 +369,16 @@ class Photographs(Queries):
     def known_cameras(self) -> bool:
         return all(image.camera.focal_deviation == 0 for image in self._images.values())
 
-    def describe(self) -> list[str]:
-        """Describe images that are missing from the camera list."""
-        lines = []
-        if self.without_row:
-            text = f"{len(self.without_row)} images are not in the list of cameras"
-            lines.append(f"{text}, their cameras are estimated: {_first(self.without_row)}")
-        return lines
+    def describe(self) -> str:
+        """Describe images that are missing from the camera list, if any."""
+        names = self.without_row
+        if not names:
+            return ""
+        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+        return (
+            f"{len(names)} images are not in the list of cameras, their cameras are estimated: "
+            f"{', '.join(names[:5])}{more}"
+        )
 
     def query(self, name: str) -> Query:
         image = self._images[name]
@@ -449,11 +452,6 @@ class Photographs(Queries):
         folder = Path(self._frames.name) / name
         for frame in extract_frames(path, folder, every):
             self._add(f"{name}/{frame}", folder / frame, camera, is_frame=True)
-
-
-def _first(names: Sequence[str]) -> str:
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return ", ".join(names[:5]) + more
 
 
 def _calibrated(root: Path) -> dict[str, Camera]:
