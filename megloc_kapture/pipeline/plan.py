@@ -70,10 +70,6 @@ class Workspace:
     def manifest(self, stage: str) -> Manifest | None:
         return read_manifest(self.manifest_path(stage))
 
-    def manifest_paths(self) -> list[Path]:
-        paths = (self.root / "stages").glob("*.json")
-        return sorted(path for path in paths if path.name[0] != ".")
-
     def partial_path(self, stage: str) -> Path:
         """Return the folder of a stage's unfinished output."""
         return self.root / PARTIAL / stage
@@ -194,6 +190,12 @@ def read_manifest(path: Path) -> Manifest | None:
         return read_json_model(path, Manifest)
     except DataError:
         return None
+
+
+def read_manifests(workspace: Path) -> dict[str, Manifest]:
+    """Return the readable manifests of a workspace by stage."""
+    manifests = map(read_manifest, sorted((workspace / "stages").glob("[!.]*.json")))
+    return {manifest.stage: manifest for manifest in manifests if manifest is not None}
 
 
 State = Literal["run", "kept", "pending", "skipped"]
@@ -331,7 +333,7 @@ def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[
     missing = [path for path in stage.reads if not any(is_below(path, other) for other in written)]
     if not missing:
         return {}
-    manifests = [m for path in workspace.manifest_paths() if (m := read_manifest(path)) is not None]
+    manifests = read_manifests(workspace.root).values()
     outputs = {}
     for path in missing:
         made = [m for m in manifests if any(is_below(path, output) for output in m.outputs)]
@@ -364,12 +366,9 @@ def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
 
 
 def _take_over(stage: Stage, workspace: Workspace) -> None:
-    for path in workspace.manifest_paths():
-        other = read_manifest(path)
-        if other is None or other.stage == stage.name:
-            continue
-        if not set(other.outputs).isdisjoint(stage.writes):
-            path.unlink(missing_ok=True)
+    for name, other in read_manifests(workspace.root).items():
+        if name != stage.name and not set(other.outputs).isdisjoint(stage.writes):
+            workspace.manifest_path(name).unlink(missing_ok=True)
 
 
 def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:

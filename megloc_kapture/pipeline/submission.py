@@ -47,7 +47,7 @@ from megloc_kapture.pipeline.datasets import (
     check_known,
     dataset_names,
 )
-from megloc_kapture.pipeline.plan import Manifest, read_manifest
+from megloc_kapture.pipeline.plan import Manifest, read_manifests
 from megloc_kapture.stages import scene
 from megloc_kapture.values import LocalizationResult, Pose, RigidTransform
 
@@ -125,6 +125,7 @@ def write_submission(
         "dummies": len(missing) if rules.pose_file == "mlad" else 0,
     }
     known = set(posed)
+    imported = None if beside is None else read_manifests(beside).get("import")
     entries = {
         **provenance,
         "weights": _weights(localized),
@@ -133,7 +134,7 @@ def write_submission(
             for image, result in sorted(results.items())
             if image in known and result.status == "localized" and result.confidence is not None
         },
-        "dataset_fingerprint": _dataset_fingerprint(beside),
+        "dataset_fingerprint": None if imported is None else imported.fingerprint,
         "dummies" if rules.pose_file == "mlad" else "missing": [row for row, _ in missing],
     }
     files = None if rules.pose_file == "ltvl" else list(texts)
@@ -242,15 +243,9 @@ def _mlad(results: _Results, tables: Path) -> _Content:
     return {name: format_mlad_file(image_rows) for name, image_rows in rows.items()}, posed, missing
 
 
-def _dataset_fingerprint(workspace: Path | None) -> str | None:
-    manifest = None if workspace is None else read_manifest(workspace / "stages" / "import.json")
-    return None if manifest is None else manifest.fingerprint
-
-
 def workspace_provenance(localized: Path) -> dict[str, Any]:
     """Return fingerprint, preset and options of a result, as far as manifests are up to date."""
-    manifests = _manifests(localized)
-    made = _maker(localized, manifests)
+    made, manifests = _made_by(localized)
     if made is None:
         return {}
     provenance: dict[str, Any] = {"localization_fingerprint": made.fingerprint}
@@ -263,8 +258,7 @@ def workspace_provenance(localized: Path) -> dict[str, Any]:
 
 def _weights(localized: Path) -> dict[str, str]:
     """Return the SHA-256 by file name of all network weights used for a workspace's result."""
-    manifests = _manifests(localized)
-    made = _maker(localized, manifests)
+    made, manifests = _made_by(localized)
     reached: dict[str, Manifest] = {}
     waiting = [] if made is None else [made]
     while waiting:
@@ -279,15 +273,12 @@ def _weights(localized: Path) -> dict[str, str]:
     return dict(sorted(sha_of.items()))
 
 
-def _manifests(localized: Path) -> dict[str, Manifest]:
-    paths = sorted((localized.resolve().parent / "stages").glob("*.json"))
-    manifests = map(read_manifest, paths)
-    return {manifest.stage: manifest for manifest in manifests if manifest is not None}
-
-
-def _maker(localized: Path, manifests: Mapping[str, Manifest]) -> Manifest | None:
-    name = localized.resolve().name
-    return next((manifest for manifest in manifests.values() if name in manifest.outputs), None)
+def _made_by(localized: Path) -> tuple[Manifest | None, Mapping[str, Manifest]]:
+    """Return the manifest of the stage that wrote a result, and all manifests of its workspace."""
+    place = localized.resolve()
+    manifests = read_manifests(place.parent)
+    made = (manifest for manifest in manifests.values() if place.name in manifest.outputs)
+    return next(made, None), manifests
 
 
 FOLDER = "submissions"
