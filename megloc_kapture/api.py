@@ -34,7 +34,7 @@ from megloc_kapture.io.images import (
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.pipeline.evaluation_plan import choose_run, plan_evaluation, recall_rows
-from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.executors import ExecutorKind, open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.map_making import (
@@ -256,13 +256,10 @@ def _run(
     stages: Sequence[Stage], folder: Path | str, workers: int, scheduler: str | None
 ) -> Workspace:
     workspace = Workspace(Path(folder))
-    executor = (
-        open_executor("processes", workers)
-        if scheduler is None
-        else open_executor("dask", None if workers == 1 else workers, scheduler, workspace.root)
-    )
-    with workspace.lock(), single_threaded(), executor as running:
-        run_plan(stages, workspace, Work(running, num_threads=workers))
+    kind: ExecutorKind = "processes" if scheduler is None else "dask"
+    opened = open_executor(kind, workers, scheduler, workspace.root)
+    with workspace.lock(), single_threaded(), opened as executor:
+        run_plan(stages, workspace, Work(executor, num_threads=workers))
     return workspace
 
 
