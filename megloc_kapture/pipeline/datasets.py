@@ -39,7 +39,7 @@ from megloc_kapture.errors import (
 )
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
-from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.files import first_problem, write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS
@@ -340,9 +340,7 @@ def read_benchmark(path: Path) -> BenchmarkFile:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"not TOML: {error}", path=path) from error
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DataError(f"{where}: {first['msg']}", path=path) from error
+        raise DataError(first_problem(error), path=path) from error
 
 
 def _has_depth(root: Path) -> bool:
