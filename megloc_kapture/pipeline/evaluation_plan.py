@@ -196,7 +196,13 @@ def plan_evaluation(run: Run) -> list[Stage]:
     """Return the stages of a run, in order, without writing anything."""
     options = run.options
     if options.pairs_by_points():
-        run = replace(run, source=_with_model(run))
+        source = with_model(run.source)
+        if source is None:
+            raise OptionError(
+                f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs "
+                'its points; --set \'mapping_pairs.by=["poses", "retrieval"]\' needs no model'
+            )
+        run = replace(run, source=source)
     run.source.check()
     check_weights(options)
     options.reranking.counted_types(options.local_types())
@@ -245,16 +251,6 @@ def _insert(stages: list[Stage], stage: Stage) -> None:
         if any(is_below(path, written) for path in stage.reads for written in other.writes)
     ]
     stages.insert(max(places, default=len(stages) - 1) + 1, stage)
-
-
-def _with_model(run: Run) -> DatasetChoice:
-    source = with_model(run.source)
-    if source is None:
-        raise OptionError(
-            f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs its "
-            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' needs no model'
-        )
-    return source
 
 
 class _RunStage(Stage):
