@@ -151,7 +151,7 @@ def test_every_option_stands_in_the_table_with_its_default() -> None:
     text = (REPOSITORY / "docs" / "options.md").read_text()
     pipeline, of_plugins = text.split("## Options of plugins")
     assert dict(re.findall(r"^\| `([\w.]+)` \| `(.*?)` \|", pipeline, flags=re.M)) == dict(
-        (option.key, shown(option.value)) for option in options_of(PipelineOptions())
+        (key, shown(value)) for key, value, _ in options_of(PipelineOptions())
     )
     rows = re.findall(r"^\| `(\w+)`, `(\w+)` \| `(.*?)` \|", of_plugins, flags=re.M)
     assert len(rows) > 5
@@ -165,7 +165,7 @@ def test_every_option_stands_in_the_table_with_its_default() -> None:
 
 def test_every_option_of_training_stands_in_its_table() -> None:
     text = (REPOSITORY / "docs" / "training.md").read_text()
-    expected = {one.key: shown(one.value) for one in options_of(DescriptorOptions())}
+    expected = {key: shown(value) for key, value, _ in options_of(DescriptorOptions())}
     choice = expected.pop("features")
     expected |= {"features.name": choice, "features.options": "{}"}
     assert dict(re.findall(r"^\| `([\w.]+)` \| `(.*?)` \|", text, flags=re.M)) == expected

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from pydantic.fields import FieldInfo
 
 from megloc_kapture.cli.common import Common, Reading
 from megloc_kapture.cli.maps import report_lines
@@ -29,7 +31,6 @@ from megloc_kapture.pipeline.live_source import MapMatching, local_types_of
 from megloc_kapture.pipeline.presets import (
     BASIC_OPTIONS,
     DEFAULT_PRESET,
-    Option,
     options_of,
     options_of_preset,
 )
@@ -220,21 +221,23 @@ class OptionsCommand(Common):
     def run(self) -> None:
         every = list(options_of(options_of_preset(self.preset)))
         if self.basic:
-            every = [option for option in every if option.key in BASIC_OPTIONS]
-        selected = [option for option in every if _is_below(option.key, self.key)]
+            every = [option for option in every if option[0] in BASIC_OPTIONS]
+        selected = [option for option in every if _is_below(option[0], self.key)]
         if not selected:
             selected = list(_options_of_plugins(self.key))
         if not selected:
-            steps = {option.key.rpartition(".")[0] for option in every} - {""}
-            known = sorted({*(option.key for option in every), *steps, *_plugins()})
+            keys = [key for key, _, _ in every]
+            steps = {key.rpartition(".")[0] for key in keys} - {""}
+            known = sorted({*keys, *steps, *_plugins()})
             near = get_close_matches(self.key, known, n=3)
             hint = f"did you mean {' or '.join(near)}? " if near else ""
             raise OptionError(
                 f"no option, step or plugin {self.key!r}; {hint}`megloc options` lists all options"
             )
-        for option in selected:
-            print(f"{option.key} = {shown(option.value)}")
-            print(f"    {option.kind}{f'; {option.meaning}' if option.meaning else ''}")
+        for key, value, field in selected:
+            print(f"{key} = {shown(value)}")
+            meaning = f"; {field.description}" if field.description else ""
+            print(f"    {_type_name(field.annotation)}{meaning}")
 
 
 def shown(value: Any) -> str:
@@ -248,6 +251,12 @@ def shown(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return str(value).lower()
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _type_name(annotation: Any) -> str:
+    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    text = re.sub(r"[A-Za-z_]\w*\.(?=[A-Za-z_])", "", text)
+    return re.sub(r"Literal\[(.*?)\]", lambda m: m[1].replace("', '", "' | '"), text)
 
 
 def _is_below(key: str, asked: str) -> bool:
@@ -266,7 +275,7 @@ def _plugins() -> dict[str, list[str]]:
     return groups_of
 
 
-def _options_of_plugins(name: str) -> Iterator[Option]:
+def _options_of_plugins(name: str) -> Iterator[tuple[str, Any, FieldInfo]]:
     if name == VLAD:
         yield from options_of(VladOptions(), f"{name}: options.")
     for group in _plugins().get(name, ()):

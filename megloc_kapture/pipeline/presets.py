@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 
 from megloc_kapture.errors import OptionError, check_option, suggestion
 from megloc_kapture.io.weights import MissingWeightsError, all_missing, lookup
@@ -175,35 +174,21 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
 
 
 def _similar(path: str, root: type[Options]) -> str:
-    keys = [option.key for option in options_of(root())]
+    keys = [key for key, _, _ in options_of(root())]
     elsewhere = [key for key in keys if key.endswith(f".{path.rpartition('.')[2]}")]
     steps = {key.rpartition(".")[0] for key in keys} - {""}
     similar = elsewhere or get_close_matches(path, [*keys, *steps], n=1)
     return f"did you mean {' or '.join(similar)}?" if similar else f"known: {', '.join(keys)}"
 
 
-@dataclass(frozen=True)
-class Option:
-    key: str
-    value: Any
-    kind: str
-    meaning: str
-
-
-def options_of(options: Options, prefix: str = "") -> Iterator[Option]:
+def options_of(options: Options, prefix: str = "") -> Iterator[tuple[str, Any, FieldInfo]]:
+    """Yield key, value and field of all options, also of nested ones."""
     for name, field in type(options).model_fields.items():
         value = getattr(options, name)
         if isinstance(value, Options) and not isinstance(value, PluginChoice):
             yield from options_of(value, f"{prefix}{name}.")
         else:
-            kind, meaning = _type_name(field.annotation), field.description or ""
-            yield Option(f"{prefix}{name}", value, kind, meaning)
-
-
-def _type_name(annotation: Any) -> str:
-    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
-    text = re.sub(r"[A-Za-z_]\w*\.(?=[A-Za-z_])", "", text)
-    return re.sub(r"Literal\[(.*?)\]", lambda m: m[1].replace("', '", "' | '"), text)
+            yield f"{prefix}{name}", value, field
 
 
 def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:

@@ -104,23 +104,23 @@ def test_every_option_is_listed_with_a_meaning(megloc: Any) -> None:
     listed = megloc("options").out
     every = list(options_of(PipelineOptions()))
     assert 50 < len(every) <= 60
-    for option in every:
-        assert f"\n{option.key} = {shown(option.value)}\n" in f"\n{listed}"
-        assert option.meaning and option.meaning in listed, option.key
+    for key, value, field in every:
+        assert f"\n{key} = {shown(value)}\n" in f"\n{listed}"
+        assert field.description and field.description in listed, key
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_shown_value_is_accepted_by_set(preset: str) -> None:
-    for option in options_of(PRESETS[preset]):
-        text = f"{option.key}={shown(option.value)}"
-        if isinstance(option.value, tuple) or option.key == "stages" or "none" in text:
+    for key, value, _ in options_of(PRESETS[preset]):
+        text = f"{key}={shown(value)}"
+        if isinstance(value, tuple) or key == "stages" or "none" in text:
             continue
         changed = options_of_preset(preset, assignments=[text])
-        actual = {option.key: option.value for option in options_of(changed)}[option.key]
+        actual = {key: value for key, value, _ in options_of(changed)}[key]
         if isinstance(actual, float):
-            assert actual == pytest.approx(option.value, rel=1e-3)
+            assert actual == pytest.approx(value, rel=1e-3)
         else:
-            assert actual == option.value, text
+            assert actual == value, text
 
 
 def test_options_are_listed_by_stage_key_and_plugin(megloc: Any) -> None:

@@ -252,12 +252,13 @@ def test_values_of_assignments(text: str, value: object) -> None:
 
 def test_none_disables_optional_steps() -> None:
     off, chosen = set(), set()
-    for option in options_of(PipelineOptions()):
-        if "None" in option.kind or "'none'" in option.kind:
-            options = options_of_preset(changes=[assigned([f"{option.key}=none"])])
-            found = attrgetter(option.key)(options)
-            (off if "None" in option.kind else chosen).add(option.key)
-            assert found == (None if "None" in option.kind else "none"), option.key
+    for key, _, field in options_of(PipelineOptions()):
+        kind = str(field.annotation)
+        if "None" in kind or "'none'" in kind:
+            options = options_of_preset(changes=[assigned([f"{key}=none"])])
+            found = attrgetter(key)(options)
+            (off if "None" in kind else chosen).add(key)
+            assert found == (None if "None" in kind else "none"), key
     assert {"refinement.depth.max_sigmas", "preprocessing.masks.segmenter"} <= off
     assert {"reranking.by", "localization.fallback", "localization.clusters.by"} <= chosen
     with pytest.raises(OptionError, match="option query_pairs.top_k: .*integer"):
