@@ -28,6 +28,7 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
+from megloc_kapture.retrieval.search import FusedSearch
 from megloc_kapture.stages.global_features import (
     GlobalFeaturesChoice,
     VladSettings,
@@ -35,7 +36,7 @@ from megloc_kapture.stages.global_features import (
     vlad_type,
 )
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
-from megloc_kapture.stages.image_pairs import Retrieval, most_similar, vectors_of
+from megloc_kapture.stages.image_pairs import vectors_of
 from megloc_kapture.stages.local_features import extract_all, read_frame, read_stored_image
 from megloc_kapture.stages.map_features import rows_found_again
 from megloc_kapture.stages.matches import (
@@ -404,15 +405,18 @@ class MapMatching:
         """Return the permitted map images most similar to a query, best first."""
         compared = self._compared(image.query.global_features)
         vectors = [self._of_query(kind, image, features) for kind in compared]
-        rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
-        members = np.array(sorted({self._positions[name] for name in permitted}), np.int64)
+        vectors = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
+        databases = [self._of_map(kind) for kind in compared]
+        images = self._map.images
         # usually the whole map is permitted; do not copy its vectors
-        whole = len(members) == len(self._map.images)
-        databases = [of_map if whole else of_map[members] for of_map in map(self._of_map, compared)]
-        names, weights = zip(*((kind.name, kind.weight) for kind in compared), strict=True)
-        retrieval = Retrieval(names, weights, self.options.fusion)
-        index, _ = most_similar(rows, databases, members, retrieval, self.options.query_pairs.top_k)
-        return [self._map.images[i] for i in index[0] if i >= 0]
+        if len(chosen := set(permitted)) < len(images):
+            members = [row for row, name in enumerate(images) if name in chosen]
+            databases = [of_map[members] for of_map in databases]
+            images = [images[row] for row in members]
+        weights = [kind.weight for kind in compared]
+        search = FusedSearch(self.options.query_pairs.top_k, self.options.fusion, weights)
+        rows, _ = search.find(vectors, databases)
+        return [images[row] for row in rows[0]]
 
     def is_at_hand(self, brought: Collection[str]) -> bool:
         """Return whether the map has vectors to compare with queries that have these types."""
@@ -539,10 +543,6 @@ class MapMatching:
             images, lambda image: len(local.descriptors(image)), local.descriptors, options
         )
         return vocabulary, VladSettings(local_type=local.name, options=options)
-
-    @cached_property
-    def _positions(self) -> dict[str, int]:
-        return {name: at for at, name in enumerate(self._map.images)}
 
     def _position(self, local_type: str) -> int:
         names = [base_type(local.name) for local in self.types]
