@@ -249,6 +249,7 @@ class PairsMapping(Reading, Choosing, Working):
     """Overwrite the pairs file."""
 
     def run(self) -> None:
+        _refuse_existing(self.output, force=self.force)
         mapping = self.kapture_map(self.input)
         chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
@@ -266,7 +267,6 @@ class PairsMapping(Reading, Choosing, Working):
                 restrictions=restrictions_beside(mapping.root),
                 covisible=None if covisible is None else self.kapture_map(covisible),
             )
-        _refuse_existing(self.output, force=self.force)
         write_pairs(self.output, pairs)
         self.say(f"{len(pairs)} pairs")
 
@@ -335,7 +335,6 @@ class PairsQuery(Reading, Choosing, Working):
                 matched = query.with_features([*query.features_dirs, out])
                 how = RerankingOptions(by=self.rerank_by, keep=self.rerank)
                 pairs = reranked(pairs, matched, out, local_types, how)
-        _refuse_existing(self.output, force=self.force)
         write_pairs(self.output, pairs)
         self.say(f"{len(pairs)} pairs")
 
