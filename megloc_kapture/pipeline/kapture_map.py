@@ -54,13 +54,9 @@ class MapKeypoints:
 
     def keypoints_px(self, image: str) -> NDArray[np.float32]:
         """Return keypoints float32 (N, 2 or more) of a map image."""
-        return self.to_colmap(self.stored_keypoints.read(image))
-
-    def to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Convert x and y of keypoints from the map's convention to COLMAP's."""
-        moved = np.array(keypoints, dtype=np.float32)
-        moved[:, :2] += np.float32(self.pixel_origin.keypoints_shift_px)
-        return moved
+        keypoints = np.array(self.stored_keypoints.read(image), dtype=np.float32)
+        keypoints[:, :2] += np.float32(self.pixel_origin.keypoints_shift_px)
+        return keypoints
 
     def descriptors(self, image: str) -> NDArray[Any]:
         """Return the stored descriptors (N, D) of a map image."""
@@ -84,13 +80,6 @@ class MapKeypoints:
             # other tools also use the name SIFT; COLMAP's and OpenMVG's descriptors are bytes
             choice = PluginChoice(name=_SIFT_OF[self.stored_descriptors.config.dtype.kind == "u"])
         return choice
-
-    def check(self, images: Collection[str]) -> None:
-        if not self.has_descriptors(images):
-            return
-        for image in images:
-            if image in self.stored_keypoints:
-                check_lengths(self.stored_keypoints, self.stored_descriptors, image)
 
     # opening a reader lists folders or tar members, so readers are cached
     @cached_property
@@ -209,7 +198,11 @@ class KaptureMap:
     def check(self) -> None:
         """Check the sizes of all feature files used for localization, without reading the files."""
         for keypoints in self.keypoints.values():
-            keypoints.check(self.images)
+            if not keypoints.has_descriptors(self.images):
+                continue
+            for image in self.images:
+                if image in keypoints:
+                    check_lengths(keypoints.stored_keypoints, keypoints.stored_descriptors, image)
         for name in self.global_types:
             vectors = self.folder.global_features(name)
             for image in self.images:
