@@ -89,13 +89,7 @@ def checked_folders(
     return mapping, map_data, query, query_data
 
 
-def import_kapture_folders(
-    root: Path,
-    output: Path,
-    *,
-    query_prefix: str = "",
-    protocol_change: Callable[[Protocol], Protocol] | None = None,
-) -> dict[str, float]:
+def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") -> dict[str, float]:
     """Check the folders of ``root``, rewrite them below ``output``, and link the images.
 
     ``query_prefix`` is prepended to query names if map and queries share names.
@@ -120,8 +114,6 @@ def import_kapture_folders(
     elif query_data.trajectories:
         _log.warning("%s: has poses; only those in query_gt/ are taken for true poses", query.root)
     tables = _renamed_tables(read_side_tables(root / SIDE_TABLES), rename, map_data, query_data)
-    if protocol_change is not None:
-        tables = replace(tables, protocol=protocol_change(tables.protocol))
     write_side_tables(output / SIDE_TABLES, tables)
     return {
         "map_images": len(map_data.image_names()),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -58,8 +58,6 @@ EVERY_POSE = {"localization": {"min_confidence": 0.0}}
 _PACKAGE = Path(__file__).resolve().parent.parent
 # inside the package in a wheel, next to it in a checkout
 _PLACES = (_PACKAGE / "benchmarks", _PACKAGE.parent / "benchmarks")
-
-ProtocolChange = Callable[[Protocol], Protocol]
 
 
 @dataclass(frozen=True)
@@ -122,20 +120,14 @@ class DatasetChoice:
             dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
             check_official(dataset, allow_missing=self.allow_missing)
 
-    def import_to(
-        self, root: Path, output: Path, change: ProtocolChange | None = None
-    ) -> dict[str, float]:
+    def import_to(self, root: Path, output: Path) -> dict[str, float]:
         """Import ``root`` into ``output`` and return counts for the log.
 
         Official datasets get ``megloc/summary.txt``, which compares actual and published counts.
         """
         if self.adapter is None:
-            return import_kapture_folders(
-                root, output, query_prefix=self.query_prefix, protocol_change=change
-            )
+            return import_kapture_folders(root, output, query_prefix=self.query_prefix)
         dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
-        if change is not None:
-            dataset = replace(dataset, protocol=change(dataset.protocol))
         write_official(dataset, output, allow_missing=self.allow_missing)
         if self.name.startswith(TWIN_PREFIX):
             bare = [replace(count, published=None) for count in dataset.summary]

@@ -15,7 +15,7 @@ from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.report.reports import RECALL_JSON, write_report
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_protocol
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_protocol, write_protocol
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     TWIN_PREFIX,
@@ -312,15 +312,14 @@ class Import(_RunStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         source = self._run.source
         root = work.path(WORLD) if source.root is None else source.root.resolve()
-        counts = source.import_to(root, work.out, self._change)
+        counts = source.import_to(root, work.out)
         require(counts["queries"], "no query image is left to localize", path=root)
         unreadable = set_aside_unreadable(work.out / QUERY, work.out / SIDE_TABLES, work)
+        protocol = read_protocol(work.out / SIDE_TABLES)
+        if protocol.dataset == Protocol().dataset:
+            protocol = protocol.model_copy(update={"dataset": self._run.dataset})
+        write_protocol(work.out / SIDE_TABLES, self._run.benchmark.change(protocol))
         return counts | ({"unreadable_queries": len(unreadable)} if unreadable else {})
-
-    def _change(self, given: Protocol) -> Protocol:
-        if given.dataset == Protocol().dataset:
-            given = given.model_copy(update={"dataset": self._run.dataset})
-        return self._run.benchmark.change(given)
 
 
 class Submit(_RunStage):

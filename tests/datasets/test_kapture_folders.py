@@ -108,13 +108,7 @@ def test_side_tables_are_imported_with_prefixed_queries(root: Path, tmp_path: Pa
     tables.write_world(given, world)
     protocol = tables.Protocol(dataset="mine", thresholds=((1.0, 2.0),))
     tables.write_protocol(given, protocol)
-    change = {"conditions": ("night",)}
-    import_kapture_folders(
-        root,
-        tmp_path / "out",
-        query_prefix="q",
-        protocol_change=lambda given: given.model_copy(update=change),
-    )
+    import_kapture_folders(root, tmp_path / "out", query_prefix="q")
     assert tables.read_groups(out) == {"a.png": of_map, "q/r.png": of_query}
     assert tables.read_priors(out) == {"q/r.png": ("a.png",)}
     assert tables.read_names(out) == {"q/r.png": "R"}
@@ -122,7 +116,7 @@ def test_side_tables_are_imported_with_prefixed_queries(root: Path, tmp_path: Pa
         tables.RelocalizationPair("x.txt", "a.png", "q/r.png")
     ]
     assert tables.read_world(out) == world
-    assert tables.read_protocol(out) == protocol.model_copy(update=change)
+    assert tables.read_protocol(out) == protocol
 
 
 def test_equal_names_of_map_and_queries_need_a_prefix(root: Path, tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ def test_without_megloc_twins_the_message_has_the_remedy(
         assert choose_dataset(name, tmp_path).twin is None
 
 
-def test_an_import_writes_a_summary_and_the_changed_protocol(tmp_path: Path) -> None:
+def test_an_import_writes_a_summary_and_the_protocol(tmp_path: Path) -> None:
     root, out = tmp_path / "root", tmp_path / "out"
     choice = choose_dataset("aachen", root)
     with pytest.raises(DataError, match="root: no such folder"):
@@ -106,11 +106,9 @@ def test_an_import_writes_a_summary_and_the_changed_protocol(tmp_path: Path) -> 
     (root / "images_upright" / NIGHT[0]).unlink()
     with pytest.raises(DataError, match="1 files are missing: .*--allow-missing"):
         choice.import_to(root, out)
-    counts = replace(choice, allow_missing=True).import_to(
-        root, out, lambda given: given.model_copy(update={"truth": "mine"})
-    )
+    counts = replace(choice, allow_missing=True).import_to(root, out)
     assert counts == {"map_images": 3, "queries": 3, "queries_with_truth": 0}
-    assert read_protocol(out / "megloc").truth == "mine"
+    assert read_protocol(out / "megloc").dataset == "aachen"
     text = (out / SUMMARY_FILE).read_text()
     assert "published: 824, -821" in text and NIGHT[0] in text
 
