@@ -160,21 +160,13 @@ def choose_run(
     )
     usual = options_of_preset(preset, changes=changes)
     options = options_of_preset(preset, changes=changes, assignments=assignments)
-    if "by" not in assigned(assignments).get("mapping_pairs", {}) and not has_model(source):
-        permitted = _without_covisibility(options)
-        if permitted != options:
-            _log.warning("no reference model in this data: no map pairs by co-visibility")
-        options = permitted
-    return Run(source, preset, options, benchmark, usual)
-
-
-def _without_covisibility(options: PipelineOptions) -> PipelineOptions:
-    """Drop pairing by co-visibility, which needs a reference model, if another method remains."""
+    is_asked = "by" in assigned(assignments).get("mapping_pairs", {})
     others = tuple(method for method in options.mapping_pairs.by if method != "covisibility")
-    if not others or not options.pairs_by_points():
-        return options
-    pairs = options.mapping_pairs.model_copy(update={"by": others})
-    return options.model_copy(update={"mapping_pairs": pairs})
+    if options.pairs_by_points() and others and not is_asked and not has_model(source):
+        _log.warning("no reference model in this data: no map pairs by co-visibility")
+        pairs = options.mapping_pairs.model_copy(update={"by": others})
+        options = options.model_copy(update={"mapping_pairs": pairs})
+    return Run(source, preset, options, benchmark, usual)
 
 
 WORLD = "world"
