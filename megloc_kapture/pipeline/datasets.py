@@ -140,11 +140,6 @@ class DatasetChoice:
             "queries_with_truth": 0 if truth is None else len(truth.poses()),
         }
 
-    def render_options(self) -> dict[str, Any]:
-        if self.twin is None:
-            return {}
-        return {"version": self.twin.version, "world": self.twin.options.model_dump(mode="json")}
-
 
 def summary_text(dataset: OfficialDataset) -> str:
     lines = [str(count) for count in dataset.summary]

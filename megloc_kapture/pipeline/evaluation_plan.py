@@ -31,7 +31,7 @@ from megloc_kapture.pipeline.map_making import MAP_STAGES
 from megloc_kapture.pipeline.presets import assigned, check_weights, options_of_preset
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import STAGES
+from megloc_kapture.plugins import STAGES, RenderedDataset
 from megloc_kapture.stages.guided_pyramid import PyramidQueries
 from megloc_kapture.stages.image_pairs import PairQueries
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
@@ -199,7 +199,8 @@ def plan_evaluation(run: Run) -> list[Stage]:
     check_weights(options)
     options.reranking.counted_types(options.local_types())
     options.retrieval()
-    stages: list[Stage] = [Render(run)] if run.source.twin is not None else []
+    twin = run.source.twin
+    stages: list[Stage] = [] if twin is None else [Render(twin)]
     stages.append(Import(run))
     stages += wanted_stages(PIPELINE, options)
     stages += [Submit(run), Evaluate(run)]
@@ -245,6 +246,23 @@ def _insert(stages: list[Stage], stage: Stage) -> None:
     stages.insert(max(places, default=len(stages) - 1) + 1, stage)
 
 
+class Render(Stage):
+    """Render a synthetic dataset."""
+
+    name = "render"
+    writes = (WORLD,)
+
+    def __init__(self, twin: RenderedDataset) -> None:
+        super().__init__(twin.options)
+        self._twin = twin
+
+    def settings(self) -> dict[str, Any]:
+        return {"version": self._twin.version, "world": super().settings()}
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        return self._twin.write(work.out / WORLD, work)
+
+
 class _RunStage(Stage):
     """A stage that depends on the run: dataset, preset and all options."""
 
@@ -254,20 +272,6 @@ class _RunStage(Stage):
 
     def _protocol(self) -> dict[str, Any]:
         return self._run.benchmark.change(Protocol()).model_dump(mode="json")
-
-
-class Render(_RunStage):
-    """Render a synthetic dataset."""
-
-    name = "render"
-    writes = (WORLD,)
-
-    def settings(self) -> dict[str, Any]:
-        return self._run.source.render_options()
-
-    def run(self, work: StageWork) -> Mapping[str, float]:
-        assert self._run.source.twin is not None
-        return self._run.source.twin.write(work.out / WORLD, work)
 
 
 class Import(_RunStage):
