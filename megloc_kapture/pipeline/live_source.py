@@ -28,7 +28,7 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.retrieval.search import FusedSearch
+from megloc_kapture.retrieval.search import rank_rows
 from megloc_kapture.stages.global_features import (
     GlobalFeaturesChoice,
     VladSettings,
@@ -414,8 +414,8 @@ class MapMatching:
             databases = [of_map[members] for of_map in databases]
             images = [images[row] for row in members]
         weights = [kind.weight for kind in compared]
-        search = FusedSearch(self.options.query_pairs.top_k, self.options.fusion, weights)
-        rows, _ = search.find(vectors, databases)
+        top_k, fusion = self.options.query_pairs.top_k, self.options.fusion
+        rows, _ = rank_rows(vectors, databases, top_k, fusion, weights)
         return [images[row] for row in rows[0]]
 
     def is_at_hand(self, brought: Collection[str]) -> bool:
