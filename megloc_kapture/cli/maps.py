@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import keep_unit
-from megloc_kapture.io.files import read_json_model
+from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.pipeline.kapture_map import restrictions_beside
@@ -38,7 +39,7 @@ from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
-from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
+from megloc_kapture.stages.map_refinement import REPORT_FILE, refine_map
 from megloc_kapture.stages.pose_refinement import refine_poses
 from megloc_kapture.stages.stage import LOCALIZED, MAP, counts_text
 from megloc_kapture.stages.stereo_depth import fuse_depth
@@ -108,15 +109,15 @@ def report_lines(root: Path) -> list[str]:
     path = root / "reconstruction" / REPORT_FILE
     if not path.is_file():
         return []
-    report = read_json_model(path, RefinementReport)
+    report = json.loads(read_text(path))
     rows: list[tuple[str, object, object]] = [
         ("", "points", "observations"),
-        ("before", report.points_before, report.observations_before),
+        ("before", report["points_before"], report["observations_before"]),
         *(
-            (step.name.replace("_", " "), f"-{step.points}", f"-{step.observations}")
-            for step in report.filters
+            (step["name"].replace("_", " "), f"-{step['points']}", f"-{step['observations']}")
+            for step in report["filters"]
         ),
-        ("after", report.points_after, report.observations_after),
+        ("after", report["points_after"], report["observations_after"]),
     ]
     return [f"{name:22s}{points!s:>10s}{seen!s:>14s}" for name, points, seen in rows]
 

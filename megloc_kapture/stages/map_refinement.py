@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -21,7 +20,7 @@ from scipy.spatial import cKDTree
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import depth_noise
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.files import link_images, write_json_model
+from megloc_kapture.io.files import link_images, write_json
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -64,17 +63,6 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class FilterReport(BaseModel):
-    """Removals of one filter; ``checked`` counts the points or observations that it could judge."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    name: str
-    checked: int
-    points: int
-    observations: int
-
-
 class MapSelection:
     """Points and observations of a map, with masks of those that are kept."""
 
@@ -102,7 +90,8 @@ class MapSelection:
         self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
         self.kept = self.image_ids >= 0
-        self.reports: list[FilterReport] = []
+        # by filter: the points or observations that it could judge, and its removals
+        self.reports: list[dict[str, Any]] = []
         self._covariances: Floats | None = None
 
     def observed(self) -> tuple[ObservedPoints, NDArray[np.int64]]:
@@ -141,12 +130,12 @@ class MapSelection:
     def _take_out(self, name: str, observations: Mask, points: Mask, checked: int) -> None:
         gone = self.kept & (observations | points[self.point_ids])
         self.reports.append(
-            FilterReport(
-                name=name,
-                checked=checked,
-                points=int((points & self.kept_points).sum()),
-                observations=int(gone.sum()),
-            )
+            {
+                "name": name,
+                "checked": checked,
+                "points": int((points & self.kept_points).sum()),
+                "observations": int(gone.sum()),
+            }
         )
         if self._covariances is not None and (gone & ~points[self.point_ids]).any():
             self._covariances = None  # points that lose some observations become less certain
@@ -185,19 +174,6 @@ class MapRefinementOptions(Options):
     uncertainty: UncertaintyOptions = UncertaintyOptions()
 
 
-class RefinementReport(BaseModel):
-    """``reconstruction/refinement.json``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    points_before: int
-    observations_before: int
-    points_after: int
-    observations_after: int
-    filters: tuple[FilterReport, ...]
-    options: dict[str, Any]
-
-
 def refine_map(
     source: KaptureFolder,
     output: Path,
@@ -219,29 +195,27 @@ def refine_map(
     if options.uncertainty.max_robust_sigmas is not None:
         _reject_uncertain(selection, options.uncertainty.max_robust_sigmas)
     kept = selection.kept_points
-    report = RefinementReport(
-        points_before=len(selection.xyz),
-        observations_before=len(selection.kept),
-        points_after=int(kept.sum()),
-        observations_after=int(selection.kept.sum()),
-        filters=tuple(selection.reports),
-        options=options.model_dump(),
-    )
+    num_points, num_observations = int(kept.sum()), int(selection.kept.sum())
     write_sensors(output, selection.data)
     link_images(source.root, output)
     copy_features(source, output, link_own=link_features)
     write_points3d(output, source.points3d()[kept])
     write_observations(output, selection.observations())
     write_point_covariances(output, selection.covariances()[kept])
-    write_json_model(output / "reconstruction" / REPORT_FILE, report)
-    counts: dict[str, float] = {
-        "points": report.points_after,
-        "observations": report.observations_after,
+    report = {
+        "points_before": len(selection.xyz),
+        "observations_before": len(selection.kept),
+        "points_after": num_points,
+        "observations_after": num_observations,
+        "filters": selection.reports,
+        "options": options.model_dump(mode="json"),
     }
-    for removed in report.filters:
-        counts[f"checked_by_{removed.name}"] = removed.checked
-        counts[f"points_removed_by_{removed.name}"] = removed.points
-        counts[f"observations_removed_by_{removed.name}"] = removed.observations
+    write_json(output / "reconstruction" / REPORT_FILE, report)
+    counts: dict[str, float] = {"points": num_points, "observations": num_observations}
+    for removed in selection.reports:
+        counts[f"checked_by_{removed['name']}"] = removed["checked"]
+        counts[f"points_removed_by_{removed['name']}"] = removed["points"]
+        counts[f"observations_removed_by_{removed['name']}"] = removed["observations"]
     return counts
 
 
