@@ -24,7 +24,7 @@ from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages.map_features import copy_features
-from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
+from megloc_kapture.stages.scene import depth_of, depth_records
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
@@ -166,7 +166,6 @@ def lift_map(
         path=mapping.root,
     )
     row_of = {image: row for row, image in enumerate(images)}
-    jobs = [(image, records[image]) for image in with_depth]
     points: list[NDArray[np.float64]] = []
     seen: dict[str, Observations] = {}
     total = 0
@@ -174,7 +173,7 @@ def lift_map(
         image_ids: list[NDArray[np.int32]] = []
         keypoint_ids: list[NDArray[np.int32]] = []
         lift = partial(_lift, mapping, local_type)
-        results = work.map(lift, jobs, f"lifting {local_type}")
+        results = work.map(lift, with_depth, f"lifting {local_type}")
         for image, (lifted, ids) in zip(with_depth, results, strict=True):
             points.append(poses[image].inverse().apply(lifted))
             image_ids.append(np.full(len(ids), row_of[image], np.int32))
@@ -194,13 +193,14 @@ def lift_map(
 
 
 def _lift(
-    mapping: KaptureFolder, local_type: str, job: tuple[str, DepthRecord]
+    mapping: KaptureFolder, local_type: str, image: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Return points in the camera frame (N, 3) and their keypoint ids (N,)."""
-    image, depth = job
+    depth = depth_of(mapping, image)
+    assert depth is not None
     points, valid = lift_keypoints(
         mapping.keypoints(local_type).read(image),
-        read_depth(mapping, depth),
+        depth.depth_m,
         mapping.read().camera_of(image),
         depth.camera,
         depth.image_from_depth,

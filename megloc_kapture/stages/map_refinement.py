@@ -45,9 +45,10 @@ from megloc_kapture.mapping.uncertainty import (
     too_uncertain,
     track_lengths,
 )
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.map_features import copy_features
-from megloc_kapture.stages.scene import DepthRecord, check_points, depth_records, read_depth
+from megloc_kapture.stages.scene import check_points, depth_of, depth_records
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
@@ -234,7 +235,7 @@ def _verify_depth(
     records = depth_records(selection.data) if options.max_sigmas is not None else {}
     folder = selection.source
     with_depth = {
-        row: records[image]
+        row
         for row, image in enumerate(selection.images)
         if image in records and folder.depth_path(records[image].path).is_file()
     }
@@ -250,12 +251,9 @@ def _verify_depth(
         if image in with_depth and len(chosen := rows[~lifted[rows]])
     ]
 
-    def job(image: int, rows: NDArray[np.int64]) -> _DepthJob:
-        points, depth = observed.point_ids[rows], with_depth[image]
-        pose = observed.cams_from_world[image]
-        axis = (depth.image_from_depth.inverse() @ pose).rotation_matrix()[2]
-        variances = _quadratic_form(covariances[points], axis)
-        return depth, pose.apply(observed.xyz[points]), KEYPOINT_NOISE_PX * np.sqrt(variances)
+    def job(image: int, rows: NDArray[np.int64]) -> tuple[str, Floats, Floats]:
+        points = observed.point_ids[rows]
+        return selection.images[image], observed.xyz[points], covariances[points]
 
     dropped = np.zeros(len(selection.kept), dtype=bool)
     num_checked = 0
@@ -266,51 +264,46 @@ def _verify_depth(
         dropped[placed[rows[contradicted]]] = True
         num_checked += checked
     if lifted.any():
-        views, neighbours = _scans(selection, with_depth, restrictions)
+        scans, neighbours = _scans(selection, sorted(with_depth), restrictions)
         rows = np.flatnonzero(lifted)
         votes, judged = _votes_of_other_scans(
-            observed, rows, views, neighbours, folder, options, work
+            selection, observed, rows, scans, neighbours, options, work
         )
         dropped[placed[rows[votes < 0]]] = True
         num_checked += int(judged.sum())
     selection.drop_observations("depth", dropped, num_checked)
 
 
-_DepthView = tuple[DepthRecord, RigidTransform]
-
-
 def _scans(
-    selection: MapSelection, with_depth: Mapping[int, DepthRecord], restrictions: Restrictions
-) -> tuple[list[dict[int, _DepthView]], list[set[int]]]:
-    """Return the depth views of each scan by image, and the nearest scans of each."""
-    images = list(with_depth)
-    views: list[dict[int, _DepthView]] = []
+    selection: MapSelection, images: Sequence[int], restrictions: Restrictions
+) -> tuple[list[list[int]], list[set[int]]]:
+    """Return the images with depth of each scan, and the nearest scans of each."""
+    scans: list[list[int]] = []
     neighbours: list[set[int]] = []
     for members in restrictions.frames([selection.images[row] for row in images]):
         rows = [images[member] for member in members]
-        cams = [selection.cams_from_world[row] for row in rows]
-        centres = np.array([cam.center() for cam in cams])
+        centres = np.array([selection.cams_from_world[row].center() for row in rows])
         pairs = cKDTree(centres).query_pairs(_SAME_CENTRE_M, output_type="ndarray")
         links = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(rows), len(rows)))
         count, scan_of = connected_components(links, directed=False)
-        first = len(views)
-        views += [{} for _ in range(count)]
-        for scan, row, cam in zip(scan_of.tolist(), rows, cams, strict=True):
-            views[first + scan][row] = with_depth[row], cam
+        first = len(scans)
+        scans += [[] for _ in range(count)]
+        for scan, row in zip(scan_of.tolist(), rows, strict=True):
+            scans[first + scan].append(row)
         centres = centres[np.unique(scan_of, return_index=True)[1]]
         # the nearest is the scan itself, which is removed below
         ranks = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
         nearest = cKDTree(centres).query(centres, k=ranks)[1] + first
         neighbours += [set(others) - {at} for at, others in enumerate(nearest.tolist(), first)]
-    return views, neighbours
+    return scans, neighbours
 
 
 def _votes_of_other_scans(
+    selection: MapSelection,
     observed: ObservedPoints,
     lifted: NDArray[np.int64],
-    views: Sequence[Mapping[int, _DepthView]],
+    scans: Sequence[Sequence[int]],
     neighbours: Sequence[Collection[int]],
-    folder: KaptureFolder,
     options: DepthVerificationOptions,
     work: Work,
 ) -> tuple[NDArray[np.int64], Mask]:
@@ -319,24 +312,24 @@ def _votes_of_other_scans(
     A scan votes +1 if it has a surface at the point, -1 if it sees through the point.
     """
     scan_of = np.full(len(observed.cameras), -1)
-    for number, of_scan in enumerate(views):
-        scan_of[list(of_scan)] = number
+    for number, images in enumerate(scans):
+        scan_of[images] = number
     own_scan = scan_of[observed.image_ids[lifted]]
     order = np.argsort(own_scan, kind="stable")
-    rows_of_scan = np.split(order, np.searchsorted(own_scan[order], np.arange(1, len(views))))
-    judged_rows: list[list[NDArray[np.int64]]] = [[] for _ in views]
+    rows_of_scan = np.split(order, np.searchsorted(own_scan[order], np.arange(1, len(scans))))
+    judged_rows: list[list[NDArray[np.int64]]] = [[] for _ in scans]
     for rows, others in zip(rows_of_scan, neighbours, strict=True):
         for other in others:
             judged_rows[other].append(rows)
     asked = [
-        (list(of_scan.values()), np.concatenate(parts))
-        for of_scan, parts in zip(views, judged_rows, strict=True)
+        ([selection.images[row] for row in images], np.concatenate(parts))
+        for images, parts in zip(scans, judged_rows, strict=True)
         if parts
     ]
     points = observed.point_ids[lifted]
     sigmas = depth_noise(mean_depths(observed)[points], options.noise)
-    jobs = ((of_scan, observed.xyz[points[rows]], sigmas[rows]) for of_scan, rows in asked)
-    judge = partial(_judge, folder, options)
+    jobs = ((images, observed.xyz[points[rows]], sigmas[rows]) for images, rows in asked)
+    judge = partial(_judge, selection.source, options)
     votes, judged = np.zeros(len(lifted), np.int64), np.zeros(len(lifted), bool)
     results = work.map(judge, jobs, "depth of other scans", len(asked))
     for (_, rows), (through, agreeing) in zip(asked, results, strict=True):
@@ -348,16 +341,18 @@ def _votes_of_other_scans(
 def _judge(
     folder: KaptureFolder,
     options: DepthVerificationOptions,
-    job: tuple[list[_DepthView], Floats, Floats],
+    job: tuple[list[str], Floats, Floats],
 ) -> tuple[Mask, Mask]:
-    views, xyz, sigmas = job
+    """Return masks of the points (N, 3) that a scan's images see through, and find a surface at."""
+    images, xyz, sigmas = job
     through, agreeing = np.zeros((2, len(xyz)), dtype=bool)
-    for record, cam_from_world in views:
+    for image in images:
+        depth, cam_from_world = _depth_and_pose(folder, image)
         before, behind, checked = compare_with_depth(
             cam_from_world.apply(xyz),
-            read_depth(folder, record),
-            record.camera,
-            record.image_from_depth,
+            depth.depth_m,
+            depth.camera,
+            depth.image_from_depth,
             options,
             sigmas,
         )
@@ -366,8 +361,30 @@ def _judge(
     return through & ~agreeing, agreeing
 
 
-# depth, points (N, 3) in the image's frame, their standard deviations (N,) along the depth axis
-_DepthJob = tuple[DepthRecord, Floats, Floats]
+def _compare(
+    folder: KaptureFolder,
+    options: DepthVerificationOptions,
+    job: tuple[str, Floats, Floats],
+) -> tuple[Mask, int]:
+    """Return a mask of the points that an image's depth contradicts; count those with depth."""
+    image, xyz, covariances = job
+    depth, cam_from_world = _depth_and_pose(folder, image)
+    axis = (depth.image_from_depth.inverse() @ cam_from_world).rotation_matrix()[2]
+    before, behind, checked = compare_with_depth(
+        cam_from_world.apply(xyz),
+        depth.depth_m,
+        depth.camera,
+        depth.image_from_depth,
+        options,
+        KEYPOINT_NOISE_PX * np.sqrt(_quadratic_form(covariances, axis)),
+    )
+    return before | behind, int(checked.sum())
+
+
+def _depth_and_pose(folder: KaptureFolder, image: str) -> tuple[DepthView, RigidTransform]:
+    depth, cam_from_world = depth_of(folder, image), folder.read().cam_from_world(image)
+    assert depth is not None and cam_from_world is not None
+    return depth, cam_from_world
 
 
 def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
@@ -375,16 +392,6 @@ def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
     x, y, z = axis
     weights = np.array([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z])
     return np.maximum(covariances @ weights, 0.0)
-
-
-def _compare(
-    folder: KaptureFolder, options: DepthVerificationOptions, job: _DepthJob
-) -> tuple[Mask, int]:
-    depth, points, sigmas = job
-    before, behind, checked = compare_with_depth(
-        points, read_depth(folder, depth), depth.camera, depth.image_from_depth, options, sigmas
-    )
-    return before | behind, int(checked.sum())
 
 
 def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None:

@@ -245,12 +245,6 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
     return depth_of
 
 
-def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
-    """Read depth (H, W) of a record; 0 means unknown."""
-    size = {"width": record.camera.width, "height": record.camera.height}
-    return read_depth_map(folder.depth_path(record.path), **size)
-
-
 _Carried = Mapping[str, Mapping[str, RigidTransform]]
 
 
@@ -306,7 +300,9 @@ def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
     record = _depth_records_of(folder).get(name)
     if record is None:
         return None
-    return DepthView(record.camera, read_depth(folder, record), record.image_from_depth)
+    path, camera = folder.depth_path(record.path), record.camera
+    depth_m = read_depth_map(path, width=camera.width, height=camera.height)
+    return DepthView(camera, depth_m, record.image_from_depth)
 
 
 def _mask_of(folder: KaptureFolder, name: str) -> NDArray[np.bool_] | None:

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import reduced_size
-from megloc_kapture.io.images import is_image, read_depth_map, read_image_rgb
+from megloc_kapture.io.images import is_image, read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
-from megloc_kapture.plugins import DepthView
 from megloc_kapture.preprocessing.frames import resized, scaled_camera
-from megloc_kapture.stages.scene import depth_records
+from megloc_kapture.stages.scene import depth_of, depth_records
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.training.labels import (
     Labels,
@@ -75,7 +74,7 @@ class PosedPairs:
         self.folder, self._kapture, self._max_size_px = folder.root, folder, max_size_px
         data = folder.read()
         poses, records = data.poses(), depth_records(data)
-        self._poses, self._records = poses, records
+        self._poses = poses
         self._names = [name for name in sorted(poses) if name in records]
         self._view = lru_cache(maxsize=_VIEWS_KEPT)(self._read_view)
         if measured is not None and measured.is_file():
@@ -134,11 +133,9 @@ class PosedPairs:
         return overlap(a, b)
 
     def _read_view(self, name: str) -> PosedView:
-        camera, record = self._kapture.read().camera_of(name), self._records[name]
+        camera, depth = self._kapture.read().camera_of(name), depth_of(self._kapture, name)
+        assert depth is not None
         size = reduced_size(camera.width, camera.height, self._max_size_px)
-        path, sensor = self._kapture.depth_path(record.path), record.camera
-        depth_m = read_depth_map(path, width=sensor.width, height=sensor.height)
-        depth = DepthView(sensor, depth_m, record.image_from_depth)
         return PosedView(scaled_camera(camera, *size), self._poses[name], depth)
 
 

@@ -41,7 +41,7 @@ from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
 from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions, refine_map
-from megloc_kapture.stages.scene import depth_records, index_map, read_depth
+from megloc_kapture.stages.scene import depth_of, depth_records, index_map
 from megloc_kapture.stages.stereo_depth import DEPTH_FILE, fuse_depth, side_file
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -138,8 +138,10 @@ def test_resolution_follows_the_accuracy_of_the_poses(world: Any, tmp_path: Path
     options = OPTIONS.model_copy(update={"mode": "depth", "max_size_px": 400})
     densify_map(folder, tmp_path / "out", options)
     out = KaptureFolder(tmp_path / "out")
-    for image, record in depth_records(out.read()).items():
-        depth, sigma = read_depth(out, record), np.load(side_file(out.root, image, "sigma"))
+    for image in depth_records(out.read()):
+        view, sigma = depth_of(out, image), np.load(side_file(out.root, image, "sigma"))
+        assert view is not None
+        depth = view.depth_m
         assert max(depth.shape) == fitted.max_size_px
         # half a pixel at 4 to 6 m with a baseline of 1 m is 2 to 4 % of the depth
         assert 0.02 < np.median(sigma[depth > 0] / depth[depth > 0]) < 0.08
