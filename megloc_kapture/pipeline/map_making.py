@@ -15,7 +15,6 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -237,7 +236,7 @@ def plan_photographs(
     stages.append(FindPoses(options, structure))
     with_poses = wanted_stages(_WITH_POSES, options)
     for stage in with_poses:
-        stage.layout = replace(stage.layout, posed=True)
+        stage.posed = True
     return [*stages, *with_poses]
 
 

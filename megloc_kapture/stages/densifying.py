@@ -51,7 +51,7 @@ from megloc_kapture.stages.scene import (
     with_noise,
     write_array,
 )
-from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
+from megloc_kapture.stages.stage import MAP, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
     FOLDER,
@@ -372,7 +372,7 @@ class Densify(PipelineStage):
     version = 4
     uses = ("mvs",)
     explained_by = ("mvs.mode",)
-    inputs = (Layout.sparse_map, SIDE_TABLES)
+    inputs = (PipelineStage.sparse_map, SIDE_TABLES)
     outputs = (MAP,)
 
     def is_wanted(self) -> bool:
@@ -383,7 +383,7 @@ class Densify(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return densify_map(
-            work.folder(self.layout.sparse_map()),
+            work.folder(self.sparse_map()),
             work.out / MAP,
             self.options.mvs,
             restrictions=Restrictions.read(work.path(SIDE_TABLES)),

@@ -280,7 +280,7 @@ class ExtractGlobalFeatures(PipelineStage):
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
-        images = (self.layout.mapping(), self.layout.query())
+        images = (self.mapping(), self.query())
         return (*images, LOCAL_FEATURES) if self._trains() else images
 
     def _trains(self) -> bool:
@@ -298,8 +298,8 @@ class ExtractGlobalFeatures(PipelineStage):
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        queries, counts = work.folders((self.layout.query(),), FEATURES), {}
-        mapping = work.folder(self.layout.mapping(), FEATURES)
+        queries, counts = work.folders((self.query(),), FEATURES), {}
+        mapping = work.folder(self.mapping(), FEATURES)
         for chosen in self.options.global_features:
             if chosen.is_vlad:
                 vlad = chosen.vlad_options()

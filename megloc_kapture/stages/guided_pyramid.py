@@ -72,7 +72,6 @@ from megloc_kapture.stages.stage import (
     QUERY_MATCHES,
     QUERY_PAIRS,
     QUERY_PYRAMID,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -547,14 +546,14 @@ class PyramidMapping(_AgainStage):
         "guided_pyramid",
         "mask_margin_px",
     )
-    inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
+    inputs = (PipelineStage.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
     outputs = (MAPPING_PYRAMID,)
 
     def is_wanted(self) -> bool:
         return super().is_wanted() and self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
+        mapping = work.folder(self.mapping(), FEATURES, MAPPING_MATCHES)
         pairs = mapping_pairs(work, mapping)
         return self._match_again(work, mapping, mapping, pairs, self.options.verify_mapping())
 
@@ -573,17 +572,17 @@ class PyramidQueries(_AgainStage):
         "mask_margin_px",
     )
     inputs = (
-        Layout.mapping,
-        Layout.query,
+        PipelineStage.mapping,
+        PipelineStage.query,
         LOCAL_FEATURES,
-        Layout.mapping_matches,
+        PipelineStage.mapping_matches,
         QUERY_PAIRS,
         QUERY_MATCHES,
     )
     outputs = (QUERY_PYRAMID,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.layout.query(), FEATURES, QUERY_MATCHES)
-        mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
+        query = work.folder(self.query(), FEATURES, QUERY_MATCHES)
+        mapping = work.folder(self.mapping(), FEATURES, *self.mapping_matches())
         pairs = read_pairs(work.path(QUERY_PAIRS))
         return self._match_again(work, query, mapping, pairs, self.options.verify_queries())

@@ -43,7 +43,6 @@ from megloc_kapture.stages.stage import (
     MAPPING_PAIRS,
     QUERY_PAIRS,
     REFERENCE,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -345,7 +344,7 @@ class PairMapping(PipelineStage):
     version = 4
     uses = ("mapping_pairs", *RETRIEVAL_OPTIONS)
     explained_by = ("map", "mapping_pairs.by")
-    inputs = (Layout.mapping, SIDE_TABLES, GLOBAL_FEATURES, Layout.pairing_points)
+    inputs = (PipelineStage.mapping, SIDE_TABLES, GLOBAL_FEATURES, PipelineStage.pairing_points)
     outputs = (MAPPING_PAIRS,)
 
     def is_wanted(self) -> bool:
@@ -353,7 +352,7 @@ class PairMapping(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_map_images(
-            work.folder(self.layout.mapping(), FEATURES),
+            work.folder(self.mapping(), FEATURES),
             self.options.mapping_pairs,
             retrieval=self.options.retrieval(),
             restrictions=Restrictions.read(work.path(SIDE_TABLES)),
@@ -369,20 +368,20 @@ class PairQueries(PipelineStage):
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
     explained_by = ("query_pairs.by", "query_pairs.top_k")
-    inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES)
-    outputs = (Layout.candidates,)
+    inputs = (PipelineStage.mapping, PipelineStage.query, SIDE_TABLES, GLOBAL_FEATURES)
+    outputs = (PipelineStage.candidates,)
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        return "query_pairs" if self.layout.candidates() == QUERY_PAIRS else "query_candidates"
+        return "query_pairs" if self.candidates() == QUERY_PAIRS else "query_candidates"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_queries(
-            work.folder(self.layout.mapping(), FEATURES),
-            work.folder(self.layout.query(), FEATURES),
+            work.folder(self.mapping(), FEATURES),
+            work.folder(self.query(), FEATURES),
             self.options.query_pairs,
             retrieval=self.options.retrieval(),
             restrictions=Restrictions.read(work.path(SIDE_TABLES)),
         )
-        write_pairs(work.out / self.layout.candidates(), pairs)
+        write_pairs(work.out / self.candidates(), pairs)
         return {"pairs": len(pairs)}

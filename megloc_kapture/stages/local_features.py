@@ -29,7 +29,6 @@ from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
     LOCAL_TYPES,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -214,14 +213,14 @@ class ExtractLocalFeatures(PipelineStage):
     resumes = True
     uses = ("mask_margin_px", *LOCAL_TYPES)
     explained_by = ("local_features",)
-    inputs = (Layout.mapping, Layout.query)
+    inputs = (PipelineStage.mapping, PipelineStage.query)
     outputs = (LOCAL_FEATURES,)
 
     def plugins(self) -> Sequence[object]:
         return self.options.make_extractors()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        folders = work.folders((self.layout.mapping(), self.layout.query()))
+        folders = work.folders((self.mapping(), self.query()))
         counts: Counter[str] = Counter()
         for extractor in self.options.make_extractors():
             margin_px = self.options.mask_margin_px

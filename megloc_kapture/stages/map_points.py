@@ -31,7 +31,6 @@ from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
     LOCAL_TYPES,
     UNREFINED,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -230,12 +229,12 @@ class MakePoints(PipelineStage):
     version = 4
     uses = ("map", "triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
     explained_by = ("map",)
-    inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES, Layout.mapping_matches)
+    inputs = (PipelineStage.mapping, LOCAL_FEATURES, GLOBAL_FEATURES, PipelineStage.mapping_matches)
     outputs = (UNREFINED,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         options, out = self.options, work.out / UNREFINED
-        mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
+        mapping = work.folder(self.mapping(), FEATURES, *self.mapping_matches())
         if not options.triangulates():
             return lift_map(mapping, options.local_types(), out, work=work)
         types, threads = options.matched_types(), work.num_threads

@@ -49,7 +49,7 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import check_points, depth_of, depth_records
-from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
+from megloc_kapture.stages.stage import UNREFINED, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
 
@@ -411,10 +411,10 @@ class RefineMap(PipelineStage):
     uses = ("refinement",)
     explained_by = ("refinement.depth.max_sigmas", "refinement.uncertainty.max_robust_sigmas")
     inputs = (UNREFINED, SIDE_TABLES)
-    outputs = (Layout.sparse_map,)
+    outputs = (PipelineStage.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        folder, out = work.folder(UNREFINED), work.out / self.layout.sparse_map()
+        folder, out = work.folder(UNREFINED), work.out / self.sparse_map()
         counts = refine_map(
             folder,
             out,

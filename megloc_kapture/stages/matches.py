@@ -51,7 +51,6 @@ from megloc_kapture.stages.stage import (
     MAPPING_MATCHES,
     MAPPING_PAIRS,
     QUERY_MATCHES,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -431,7 +430,7 @@ class MatchMapping(PipelineStage):
     resumes = True
     explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "mapping_verification")
-    inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
+    inputs = (PipelineStage.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
     outputs = (MAPPING_MATCHES,)
 
     def is_wanted(self) -> bool:
@@ -444,10 +443,10 @@ class MatchMapping(PipelineStage):
         return self.options.verify_mapping()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping(), FEATURES)
+        mapping = work.folder(self.mapping(), FEATURES)
         pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
         # the poses of photographs are not given, but estimated from the same matches
-        if isinstance(self.verification(), KnownPoseOptions) and not self.layout.posed:
+        if isinstance(self.verification(), KnownPoseOptions) and not self.posed:
             name = self.options.main_type()
             check_given_poses(mapping, pairs, name, self.options.make_matcher(name), work)
         counts: Counter[str] = Counter()
@@ -465,16 +464,16 @@ class MatchQueries(PipelineStage):
     resumes = True
     explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "query_verification")
-    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates)
+    inputs = (PipelineStage.mapping, PipelineStage.query, LOCAL_FEATURES, PipelineStage.candidates)
     outputs = (QUERY_MATCHES,)
 
     def plugins(self) -> Sequence[object]:
         return [self.options.make_matcher(name) for name in self.options.local_types()]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.layout.query(), FEATURES)
-        mapping = work.folder(self.layout.mapping(), FEATURES)
-        pairs, out = read_pairs(work.path(self.layout.candidates())), work.out / QUERY_MATCHES
+        query = work.folder(self.query(), FEATURES)
+        mapping = work.folder(self.mapping(), FEATURES)
+        pairs, out = read_pairs(work.path(self.candidates())), work.out / QUERY_MATCHES
         counts: Counter[str] = Counter()
         for name in self.options.local_types():
             matcher, how = self.options.make_matcher(name), self.options.verify_queries()

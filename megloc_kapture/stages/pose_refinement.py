@@ -51,7 +51,6 @@ from megloc_kapture.stages.stage import (
     MAP,
     REFINEMENT_TIMING,
     UNREFINED_POSES,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -321,7 +320,7 @@ class RefinePoses(PipelineStage):
     version = 4
     uses = ("pose_refinement",)
     explained_by = ("pose_refinement.by",)
-    inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
+    inputs = (SIDE_TABLES, PipelineStage.query, MAP, UNREFINED_POSES)
     outputs = (LOCALIZED, REFINEMENT_TIMING)
 
     def explain(self) -> str:
@@ -336,7 +335,7 @@ class RefinePoses(PipelineStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         return refine_poses(
             work.folder(MAP),
-            work.folder(self.layout.query()),
+            work.folder(self.query()),
             work.folder(UNREFINED_POSES),
             work.out / LOCALIZED,
             self.options.pose_refinement,

@@ -54,7 +54,6 @@ from megloc_kapture.stages.stage import (
     QUERY,
     QUERY_PAIRS,
     TIMING,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -328,20 +327,20 @@ class LocalizeQueries(PipelineStage):
     inputs = (
         MAPPING,
         QUERY,
-        Layout.query,
+        PipelineStage.query,
         SIDE_TABLES,
         LOCAL_FEATURES,
         MAP,
         QUERY_PAIRS,
-        Layout.query_matches,
+        PipelineStage.query_matches,
     )
-    outputs = (Layout.poses, TIMING)
+    outputs = (PipelineStage.poses, TIMING)
 
     def plugins(self) -> Sequence[object]:
         return (self.options.localization.make_ranker(),)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.layout.query(), FEATURES, *self.layout.query_matches())
+        query = work.folder(self.query(), FEATURES, *self.query_matches())
         pairs = read_pairs(work.path(QUERY_PAIRS))
         options, tables = self.options.localization, work.path(SIDE_TABLES)
         results = localize_from_matches(
@@ -355,7 +354,7 @@ class LocalizeQueries(PipelineStage):
             scratch=work.out,
         )
         return write_localized(
-            work.out / self.layout.poses(),
+            work.out / self.poses(),
             work.folder(QUERY),
             chain(results, unreadable_queries(tables)),
             fallback=options.fallback,

@@ -26,7 +26,6 @@ from megloc_kapture.stages.stage import (
     QUERY_CANDIDATES,
     QUERY_MATCHES,
     QUERY_PAIRS,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -156,7 +155,7 @@ class RerankQueries(PipelineStage):
     version = 4
     uses = ("reranking", *LOCAL_TYPES)
     explained_by = ("reranking.by", "reranking.keep", "reranking.local_type")
-    inputs = (Layout.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
+    inputs = (PipelineStage.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
     outputs = (QUERY_PAIRS,)
 
     def is_wanted(self) -> bool:
@@ -165,7 +164,7 @@ class RerankQueries(PipelineStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = reranked(
             read_pairs(work.path(QUERY_CANDIDATES)),
-            work.folder(self.layout.query(), FEATURES, QUERY_MATCHES),
+            work.folder(self.query(), FEATURES, QUERY_MATCHES),
             work.path(QUERY_MATCHES),
             self.options.local_types(),
             self.options.reranking,

@@ -78,58 +78,6 @@ TIMING = "timing.csv"
 FEATURES = ""  # the workspace itself holds local and global features
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Workspace paths for given options; ``posed`` means that map poses were estimated."""
-
-    options: PipelineOptions
-    posed: bool = False
-
-    def paths(self, parts: Sequence[LayoutPath]) -> list[str]:
-        names: list[str] = []
-        for part in parts:
-            part_names = part if isinstance(part, str) else part(self)
-            names += [part_names] if isinstance(part_names, str) else part_names
-        return names
-
-    def mapping(self) -> str:
-        """Return the folder of the map images: with estimated poses, pre-processed, or imported."""
-        if self.posed:
-            return POSED
-        return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
-
-    def query(self) -> str:
-        return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
-
-    def pairing_points(self) -> tuple[str, ...]:
-        """Return the dataset's prebuilt model, if its points are used to pair map images."""
-        return (REFERENCE,) if self.options.pairs_by_points() else ()
-
-    def mapping_matches(self) -> tuple[str, ...]:
-        if not self.options.triangulates():
-            return ()
-        # a pair is read from the first folder that contains it
-        again = self.options.matches_again()
-        return (MAPPING_PYRAMID, MAPPING_MATCHES) if again else (MAPPING_MATCHES,)
-
-    def query_matches(self) -> tuple[str, ...]:
-        again = self.options.matches_again()
-        return (QUERY_PYRAMID, QUERY_MATCHES) if again else (QUERY_MATCHES,)
-
-    def sparse_map(self) -> str:
-        return MAP if self.options.mvs.mode == "off" else SPARSE
-
-    def candidates(self) -> str:
-        return QUERY_CANDIDATES if self.options.reranking.reranks() else QUERY_PAIRS
-
-    def poses(self) -> str:
-        return UNREFINED_POSES if self.options.pose_refinement.refines() else LOCALIZED
-
-
-LayoutPath = str | Callable[[Layout], str | tuple[str, ...]]
-"""A path in the workspace, or a method of :class:`Layout` that returns one path or several."""
-
-
 def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
     """Return a hash of the files' sizes, modification times and names relative to ``root``."""
     digest = hashlib.sha256()
@@ -235,25 +183,27 @@ class PipelineStage(Stage):
     ----------
     uses : option keys that determine the output; ``local_features.name`` means all their names.
     explained_by : option keys that best explain whether and how the stage runs.
+    inputs, outputs : workspace paths, or methods of this class that return them.
+    posed : the poses of the map images are estimated by an earlier stage.
     """
 
     uses: ClassVar[tuple[str, ...]] = ()
     explained_by: ClassVar[tuple[str, ...]] = ()
-    inputs: ClassVar[tuple[LayoutPath, ...]] = ()
-    outputs: ClassVar[tuple[LayoutPath, ...]] = ()
+    inputs: ClassVar[tuple[WorkspacePath, ...]] = ()
+    outputs: ClassVar[tuple[WorkspacePath, ...]] = ()
+    posed = False
 
     def __init__(self, options: PipelineOptions) -> None:
         self.options: PipelineOptions = options
         self.placement = options.placement
-        self.layout = Layout(options)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
-        return self.layout.paths(self.inputs)
+        return self._paths(self.inputs)
 
     @property
     def writes(self) -> Sequence[str]:  # type: ignore[override]
-        return self.layout.paths(self.outputs)
+        return self._paths(self.outputs)
 
     def is_wanted(self) -> bool:
         return True
@@ -275,6 +225,51 @@ class PipelineStage(Stage):
         if self.placement.half_precision and any(map(has_precision, plugins)):
             chosen["precision"] = "half"
         return chosen
+
+    # ---------------------------------------------------------- workspace paths by option
+
+    def _paths(self, parts: Sequence[WorkspacePath]) -> list[str]:
+        names: list[str] = []
+        for part in parts:
+            part_names = part if isinstance(part, str) else part(self)
+            names += [part_names] if isinstance(part_names, str) else part_names
+        return names
+
+    def mapping(self) -> str:
+        """Return the folder of the map images: with estimated poses, pre-processed, or imported."""
+        if self.posed:
+            return POSED
+        return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
+
+    def query(self) -> str:
+        return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
+
+    def pairing_points(self) -> tuple[str, ...]:
+        """Return the dataset's prebuilt model, if its points are used to pair map images."""
+        return (REFERENCE,) if self.options.pairs_by_points() else ()
+
+    def mapping_matches(self) -> tuple[str, ...]:
+        if not self.options.triangulates():
+            return ()
+        # a pair is read from the first folder that contains it
+        again = self.options.matches_again()
+        return (MAPPING_PYRAMID, MAPPING_MATCHES) if again else (MAPPING_MATCHES,)
+
+    def query_matches(self) -> tuple[str, ...]:
+        again = self.options.matches_again()
+        return (QUERY_PYRAMID, QUERY_MATCHES) if again else (QUERY_MATCHES,)
+
+    def sparse_map(self) -> str:
+        return MAP if self.options.mvs.mode == "off" else SPARSE
+
+    def candidates(self) -> str:
+        return QUERY_CANDIDATES if self.options.reranking.reranks() else QUERY_PAIRS
+
+    def poses(self) -> str:
+        return UNREFINED_POSES if self.options.pose_refinement.refines() else LOCALIZED
+
+
+WorkspacePath = str | Callable[[PipelineStage], str | tuple[str, ...]]
 
 
 def wanted_stages(

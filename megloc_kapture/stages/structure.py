@@ -38,7 +38,6 @@ from megloc_kapture.stages.stage import (
     LOCAL_TYPES,
     PHOTOGRAPH_MATCHES,
     POSED,
-    Layout,
     PipelineStage,
     StageWork,
 )
@@ -82,7 +81,7 @@ class FindPoses(PipelineStage):
     name = "poses"
     version = 3
     uses = (*LOCAL_TYPES, "query_verification")
-    inputs = (Layout.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
+    inputs = (PipelineStage.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
     outputs = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
 
     def __init__(self, options: PipelineOptions, structure: StructureOptions) -> None:
@@ -93,7 +92,7 @@ class FindPoses(PipelineStage):
         return {**super().settings(), "structure": self._structure.model_dump(mode="json")}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.layout.mapping(), FEATURES, PHOTOGRAPH_MATCHES)
+        mapping = work.folder(self.mapping(), FEATURES, PHOTOGRAPH_MATCHES)
         data, structure = mapping.read(), self._structure
         models = self._models(work, mapping, data)
         world, model, counts = _scaled(models[0], structure)

@@ -27,7 +27,8 @@ from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.matches import best_pairs, iterate_candidates
-from megloc_kapture.stages.stage import MAPPING_MATCHES, QUERY_MATCHES, Layout
+from megloc_kapture.stages.query_poses import LocalizeQueries
+from megloc_kapture.stages.stage import MAPPING_MATCHES, QUERY_MATCHES
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated
 
@@ -148,8 +149,8 @@ def check_second_matches(workspace: Workspace) -> None:
         assert set(second) == set(best) and len(best) < len(first)
         # the ratio test removes matches
         assert all(row.matches < first[pair].matches for pair, row in second.items())
-        layout = Layout(options_of_preset(assignments=[*FEW, *SECOND]))
-        folders = layout.query_matches() if kind == "query" else layout.mapping_matches()
+        stage = LocalizeQueries(options_of_preset(assignments=[*FEW, *SECOND]))
+        folders = stage.query_matches() if kind == "query" else stage.mapping_matches()
         stored = workspace.folder(kind, *folders).matches(TYPE)
         for pair, row in {**first, **second}.items():
             assert stored.length(*pair) == row.verified
