@@ -227,8 +227,8 @@ def retry_query(
     method: PyramidMethod,
     frame: Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_] | None]],
     *,
-    num_found: Mapping[str, int] | None = None,
-    name: str = "query",
+    num_found: Mapping[str, int],
+    name: str,
 ) -> RetriedQuery:
     """Match candidates with few matches again, using variants of the query.
 
@@ -236,15 +236,11 @@ def retry_query(
     ----------
     matches : name, verified matches (K, 2) and scores (K,) of each candidate, best first.
     frame : reads pixels and mask of the query; called only if a candidate has few matches.
-    num_found : number of matches before verification by candidate; default: after verification.
+    num_found : number of matches before verification by candidate.
     """
     base = {other: pairs for other, pairs, _ in matches}
-    num_of = num_found or {}
-    hard = [
-        other
-        for other, pairs in base.items()
-        if method.options.is_hard(num_of.get(other, len(pairs)), len(pairs))
-    ]
+    is_hard = method.options.is_hard
+    hard = [other for other, pairs in base.items() if is_hard(num_found[other], len(pairs))]
     mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
         none = query.keypoints_px[:0], query.descriptors[:0]
@@ -287,13 +283,13 @@ def pyramid_mapping(
     method: PyramidMethod,
     output: Path,
     *,
-    num_found: Mapping[_Pair, int] | None = None,
+    num_found: Mapping[_Pair, int],
     work: Work = HERE,
 ) -> dict[str, float]:
     """Match mapping pairs with few matches again, using scaled and rotated variants of each image.
 
     ``output`` receives ``local_features/T-pyramid``. ``num_found`` counts matches before
-    verification, by default the stored ones. Return counts for the log.
+    verification. Return counts for the log.
     """
     data, poses = mapping.read(), mapping.read().poses()
 
@@ -305,9 +301,8 @@ def pyramid_mapping(
     named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
     stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
     verified = {pair: len(stored.read(*pair)[0]) for pair in named}
-    num_of = num_found or {}
     is_hard, mode = method.options.is_hard, method.options.mode
-    hard = [p for p in named if is_hard(num_of.get(p, verified[p]), verified[p]) and can_gain(*p)]
+    hard = [p for p in named if is_hard(num_found[p], verified[p]) and can_gain(*p)]
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
         others[a][0].append(b)
@@ -398,7 +393,7 @@ def pyramid_queries(
     method: PyramidMethod,
     output: Path,
     *,
-    num_found: Mapping[_Pair, int] | None = None,
+    num_found: Mapping[_Pair, int],
     work: Work = HERE,
 ) -> dict[str, float]:
     """Match query pairs with few matches again: variants of the query with the map's keypoints.
@@ -406,7 +401,6 @@ def pyramid_queries(
     The map stays unchanged; its type ``T-pyramid`` is matched if it has that type. Output and
     ``num_found`` are as in :func:`pyramid_mapping`.
     """
-    before = num_found or {}
     larger = pyramid_type(local_type)
     has_larger = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
     types = local_type, larger if has_larger else local_type
@@ -415,7 +409,7 @@ def pyramid_queries(
     for image, other in sorted(both, key=itemgetter(0)):
         candidates.setdefault(image, []).append(other)
     jobs = [
-        (image, others, {name: before[image, name] for name in others if (image, name) in before})
+        (image, others, {name: num_found[image, name] for name in others})
         for image, others in candidates.items()
     ]
     features = PyramidFeatures(output, query, local_type)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from itertools import combinations, product
 from pathlib import Path
@@ -108,6 +109,7 @@ class Scene:
         **more: Any,
     ) -> dict[str, float]:
         mapping, pairs = mapping or self.mapping(), pairs or self.pairs(name)
+        num_found = num_found or Counter()
         with single_threaded():
             if name == "mapping":
                 how = method(**{"verification": KnownPoseOptions()} | more)
