@@ -219,12 +219,12 @@ class ExtractGlobal(Reading, Choosing, Working):
                     asked = self.local_type or vlad.local_type
                     local_type = only_type(folders[0], "descriptors", asked)
                     type_name = vlad_type(local_type)
-                    counts = extract_vlad(folders[0], folders, local_type, out, vlad, work=work)
+                    count = extract_vlad(folders[0], folders, local_type, out, vlad, work=work)
                 else:
                     extractor = extractors[choice.name]
                     type_name = extractor.name
-                    counts = extract_global_features(folders, extractor, out, work=work)
-                self.say(f"{type_name}: {counts['images']} images")
+                    count = extract_global_features(folders, extractor, out, work=work)
+                self.say(f"{type_name}: {count} images")
 
 
 @dataclass(frozen=True, kw_only=True)

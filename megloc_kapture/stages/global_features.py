@@ -99,8 +99,8 @@ def extract_vlad(
     options: VladOptions,
     *,
     work: Work = HERE,
-) -> dict[str, int]:
-    """Train VLAD on ``mapping`` and write vectors of all images; return counts for the log."""
+) -> int:
+    """Train VLAD on ``mapping`` and write vectors of all images; return the number of images."""
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
     trained = read_vocabulary(place) if work.resume else None
@@ -109,8 +109,7 @@ def extract_vlad(
         write_vocabulary(place, vocabulary, local_type, options)
     else:
         vocabulary, _ = trained
-    num_centres, size = vocabulary.centres.shape[1], vocabulary.size
-    config = FeatureConfig(type_name, np.dtype(np.float32), size, metric_type="L2")
+    config = FeatureConfig(type_name, np.dtype(np.float32), vocabulary.size, metric_type="L2")
     folder_of = images_of(folders, "describe")
     is_written = partial(has_features, output, "global_features", type_name)
     todo = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
@@ -119,7 +118,7 @@ def extract_vlad(
     results = work.map(describe, todo, resumed_label("VLAD", len(folder_of), len(todo)))
     for (image, _), vector in zip(todo, results, strict=True):
         writer.write(image, vector)
-    return {"images": len(folder_of), "clusters": num_centres, "dimensions": size}
+    return len(folder_of)
 
 
 def _aggregate(local_type: str, place: Path, run_id: str, job: Job) -> NDArray[np.float32]:
@@ -201,8 +200,8 @@ def extract_global_features(
     output: Path,
     *,
     work: Work = HERE,
-) -> dict[str, int]:
-    """Write global features of all images (orphan layout); return counts for the log."""
+) -> int:
+    """Write global features of all images (orphan layout); return the number of images."""
     folder_of = images_of(folders, "describe")
     is_written = partial(has_features, output, "global_features", extractor.name)
     jobs = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
@@ -219,7 +218,7 @@ def extract_global_features(
             config = FeatureConfig(extractor.name, kind, len(vector), metric_type="L2")
             writer = FeatureWriter(output, "global_features", extractor.name, config, orphan=True)
         writer.write(image, vector)
-    return {"images": len(folder_of)}
+    return len(folder_of)
 
 
 def describe_images(
@@ -298,18 +297,16 @@ class ExtractGlobalFeatures(PipelineStage):
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        queries, counts = work.folders((self.query(),), FEATURES), {}
         mapping = work.folder(self.mapping(), FEATURES)
+        folders = [mapping, *work.folders((self.query(),), FEATURES)]
+        counts: dict[str, float] = {}
         for chosen in self.options.global_features:
             if chosen.is_vlad:
                 vlad = chosen.vlad_options()
                 name = vlad.local_type or self.options.main_type()
-                folders = [mapping, *queries]
-                type_counts = extract_vlad(mapping, folders, name, work.out, vlad, work=work)
+                number = extract_vlad(mapping, folders, name, work.out, vlad, work=work)
             else:
                 extractor = chosen.make(work.placement)
-                type_counts = extract_global_features(
-                    [mapping, *queries], extractor, work.out, work=work
-                )
-            counts[f"images_with_{chosen.name}"] = type_counts["images"]
+                number = extract_global_features(folders, extractor, work.out, work=work)
+            counts[f"images_with_{chosen.name}"] = number
         return counts
