@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
@@ -28,7 +28,6 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.local_features import mask_path, read_mask, read_stored_image
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
-_ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids", "covariances")
 _SAMPLED_IMAGES = 32
 
 
@@ -119,22 +118,21 @@ def _finite_median(parts: Sequence[NDArray[np.float64]]) -> float:
 
 
 def write_index(index: MapIndex, folder: Path) -> None:
-    arrays = [name for name in _ARRAYS if getattr(index, name) is not None]
-    for name in arrays:
-        write_array(folder / f"{name}.npy", getattr(index, name))
-    names = sorted(index.row_of_image, key=index.row_of_image.__getitem__)
-    noise = {"noise_rad": index.noise_rad, "noise_px": index.noise_px}
-    content = [arrays, names, {"local_type": index.local_type, **noise}]
-    write_bytes(folder / "index.json", json.dumps(content).encode())
+    """Write arrays as npy files, which processes can share, and other fields as JSON."""
+    values = {field.name: getattr(index, field.name) for field in fields(index)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    for name, array in arrays.items():
+        write_array(folder / f"{name}.npy", array)
+    others = {name: value for name, value in values.items() if name not in arrays}
+    write_bytes(folder / "index.json", json.dumps(others).encode())
 
 
 def open_index(folder: Path) -> MapIndex:
-    names, images, others = json.loads((folder / "index.json").read_bytes())
-    files = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names}
-    # compiled loops need plain arrays
-    arrays: dict[str, Any] = {name: np.asarray(array) for name, array in files.items()}
-    rows = {name: row for row, name in enumerate(images)}
-    return MapIndex(row_of_image=rows, **arrays, **others)
+    values = json.loads((folder / "index.json").read_bytes())
+    for file in folder.glob("*.npy"):
+        # compiled loops need plain arrays
+        values[file.stem] = np.asarray(np.load(file, mmap_mode="r"))
+    return MapIndex(**values)
 
 
 @contextmanager
