@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import MeglocError, require
 from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup
 from megloc_kapture.io.files import link_images, link_records, remove, safe_join
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
@@ -33,7 +34,7 @@ from megloc_kapture.mvs.views import (
     stereo_view,
     with_pose_errors,
 )
-from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
+from megloc_kapture.plugin_loading import load_chosen
 from megloc_kapture.plugins import (
     DEPTH_ESTIMATORS,
     DepthEstimate,
@@ -93,10 +94,6 @@ class DensifyOptions(Options):
     )
     max_size_px: int = Field(default=800, ge=64, description="longer side of the depth maps")
 
-    def make_estimator(self, placement: Placement = AUTO) -> DepthEstimator:
-        made: DepthEstimator = load_chosen(DEPTH_ESTIMATORS, self.estimator, placement)
-        return made
-
 
 @dataclass(frozen=True)
 class StereoFit:
@@ -130,7 +127,7 @@ def densify_map(
     Images are only compared within a frame, location and condition. ``link_features`` is as in
     :func:`~megloc_kapture.stages.map_refinement.refine_map`.
     """
-    estimator = options.make_estimator(work.placement)
+    estimator: DepthEstimator = load_chosen(DEPTH_ESTIMATORS, options.estimator, work.placement)
     check_points(source, "densify")
     records = source.root / "sensors" / "records_data"
     require(records.is_dir(), "the images of the map are missing", path=records)
@@ -165,7 +162,8 @@ def densify_map(
     remove(scratch)
     rows = [replace(row, fill=fills.get(row.image, 0.0)) for row in rows]
     write_sensors(output, with_depth_sensors(data, list(fills), fit.max_size_px))
-    _link_images_and_masks(source, output)
+    link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
+    link_images(source.root, output, ("masks",))
     copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
     write_depth_rows(output / DEPTH_FILE, rows)
@@ -177,12 +175,6 @@ def densify_map(
         "max_size_px": fit.max_size_px,
         "map_error_px": round(fit.error_px, 4),
     }
-
-
-def _link_images_and_masks(source: KaptureFolder, output: Path) -> None:
-    records = source.root / "sensors" / "records_data"
-    link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
-    link_images(source.root, output, ("masks",))
 
 
 # ------------------------------------------------------------------------------------ planning
@@ -236,7 +228,8 @@ def _plan(
     images_of = starts, np.repeat(np.arange(len(images)), counts)[order]
     centers = np.array([pose.center() for pose in poses.values()]).reshape(-1, 3)
     members: dict[tuple[str, str, str], NDArray[np.bool_]] = {}
-    keys = [_session(restrictions, image) for image in images]
+    session = attrgetter("frame", "location", "condition")
+    keys = [session(restrictions.groups.get(image, ImageGroup())) for image in images]
     for row, key in enumerate(keys):
         members.setdefault(key, np.zeros(len(images), bool))[row] = True
     has_depth = depth_records(data)
@@ -262,11 +255,6 @@ def _plan(
             continue
         rows.append(replace(blank, sources=sources, near_m=limits[0], far_m=limits[1]))
     return rows
-
-
-def _session(restrictions: Restrictions, image: str) -> tuple[str, str, str]:
-    group = restrictions.groups.get(image)
-    return ("", "", "") if group is None else (group.frame, group.location, group.condition)
 
 
 # ------------------------------------------------------------------------------------- images
@@ -379,7 +367,7 @@ class Densify(PipelineStage):
         return self.options.mvs.mode != "off"
 
     def plugins(self) -> Sequence[object]:
-        return (self.options.mvs.make_estimator(),)
+        return (load_chosen(DEPTH_ESTIMATORS, self.options.mvs.estimator),)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return densify_map(

@@ -80,7 +80,14 @@ class MaskOptions(Options):
     def make_classes(self, placement: Placement) -> ClassMasks | None:
         if self.segmenter is None:
             return None
-        return ClassMasks.of(load_chosen(SEGMENTERS, self.segmenter, placement), self.dynamic)
+        segmenter: Segmenter = load_chosen(SEGMENTERS, self.segmenter, placement)
+        wanted = segmenter.dynamic if self.dynamic is None else self.dynamic
+        if unknown := sorted(set(wanted) - set(segmenter.classes)):
+            raise OptionError(
+                f"segmenter {segmenter.name!r} has no class {unknown[0]!r}; "
+                f"it has: {', '.join(segmenter.classes)}"
+            )
+        return ClassMasks(segmenter, tuple(name for name in segmenter.classes if name in wanted))
 
 
 def mask_files(
@@ -137,18 +144,6 @@ class ClassMasks:
 
     segmenter: Segmenter
     dynamic: tuple[str, ...]
-
-    @classmethod
-    def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None) -> ClassMasks:
-        """Create with the given dynamic classes, by default the segmenter's."""
-        wanted = segmenter.dynamic if dynamic is None else dynamic
-        unknown = sorted(set(wanted) - set(segmenter.classes))
-        if unknown:
-            raise OptionError(
-                f"segmenter {segmenter.name!r} has no class {unknown[0]!r}; "
-                f"it has: {', '.join(segmenter.classes)}"
-            )
-        return cls(segmenter, tuple(name for name in segmenter.classes if name in wanted))
 
     def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
         """Return the label of each pixel, uint8 (H, W), of an image (H, W, 3)."""
