@@ -62,6 +62,7 @@ from megloc_kapture.stages.matches import (
     mapping_pairs,
     match_all,
     match_pairs,
+    one_way,
 )
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -298,7 +299,7 @@ def pyramid_mapping(
             return False  # cannot triangulate without a pose
         return views_can_overlap(data.camera_of(a), poses[a], data.camera_of(b), poses[b])
 
-    named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
+    named = sorted(set(map(one_way, pairs)))
     stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
     verified = {pair: len(stored.read(*pair)[0]) for pair in named}
     is_hard, mode = method.options.is_hard, method.options.mode

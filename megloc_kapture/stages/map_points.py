@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.colmap import MapImage, TriangulatedPoints, TriangulationOptions, triangulate
+from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
     ImagePair,
@@ -59,19 +59,26 @@ def triangulate_map(
     """
     types = tuple(dict.fromkeys(local_types))
     data = mapping.read()
-    images = sorted(data.poses())
+    poses = data.poses()
+    images = sorted(poses)
     require(images, "no mapping image has a pose (sensors/trajectories.txt)", path=mapping.root)
     require(len(images) > 1, "points need two or more images with poses", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
     of_type = {name: matched_pairs(mapping.matches(name), images, asked) for name in types}
-    for name in types:
-        mapping.keypoints(name)
+    keypoints_of = {name: mapping.keypoints(name) for name in types}
     xyz, errors_px = np.zeros((0, 3)), np.zeros(0)
     observations = {}
     by_type: dict[str, float] = {}
     for name, matched in of_type.items():
-        scratch = output.absolute()
-        triangulated = _triangulated(mapping, name, images, matched, options, num_threads, scratch)
+        read = keypoints_of[name].read
+        views = [
+            MapImage(image, data.camera_of(image), poses[image], read(image)[:, :2])
+            for image in images
+        ]
+        verified = matches_of(mapping.matches(name), images, matched)
+        triangulated = triangulate(
+            views, verified, options, num_threads=num_threads, scratch=output.absolute()
+        )
         observations[name] = Observations(
             keypoints_type=name,
             image_names=tuple(images),
@@ -124,25 +131,6 @@ def matched_pairs(
         if reader.length(a, b)
     ]
     return np.array(pairs, np.int64).reshape(-1, 2)
-
-
-def _triangulated(
-    mapping: KaptureFolder,
-    local_type: str,
-    names: Sequence[str],
-    pairs: NDArray[np.int64],
-    options: TriangulationOptions,
-    num_threads: int,
-    scratch: Path,
-) -> TriangulatedPoints:
-    data, keypoints = mapping.read(), mapping.keypoints(local_type)
-    poses = data.poses()
-    images = [
-        MapImage(image, data.camera_of(image), poses[image], keypoints.read(image)[:, :2])
-        for image in names
-    ]
-    verified = matches_of(mapping.matches(local_type), names, pairs)
-    return triangulate(images, verified, options, num_threads=num_threads, scratch=scratch)
 
 
 def lift_map(

@@ -145,7 +145,7 @@ def match_pairs(
     """
     within_one = first.root == second.root
     # within a map (a, b) and (b, a) are one pair, stored in one file
-    ordered = sorted({_one_way(pair) if within_one else (pair.query, pair.map) for pair in pairs})
+    ordered = sorted({one_way(pair) if within_one else (pair.query, pair.map) for pair in pairs})
     writer = MatchesWriter(output, local_type, orphan=True)
     counts: dict[tuple[str, str], PairCount] = {}
     if work.resume:
@@ -280,7 +280,8 @@ _Job = tuple[str, Sequence[str]]  # an image of the first folder, and some of th
 _Folders = tuple[KaptureFolder, KaptureFolder]
 
 
-def _one_way(pair: ImagePair) -> tuple[str, str]:
+def one_way(pair: ImagePair) -> tuple[str, str]:
+    """Return the names of a pair of map images in the order in which it is stored."""
     return min(pair.query, pair.map), max(pair.query, pair.map)
 
 

@@ -389,6 +389,5 @@ class FieldRefiner:
 
 def _checkers(shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return a checkerboard mask with ten squares along the longer side."""
-    height, width = shape
-    squares = [np.arange(side) * 10 // max(shape) for side in (height, width)]
-    return np.asarray((squares[0][:, None] + squares[1]) % 2 == 0)
+    rows, columns = np.indices(shape) * 10 // max(shape)
+    return np.asarray((rows + columns) % 2 == 0)
