@@ -14,12 +14,12 @@ from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
 from megloc_kapture.plugins import DepthView, GlobalFeatureExtractor, LocalFeatureExtractor
-from megloc_kapture.preprocessing.frames import FrameOptions, carry_points, plan_frame
+from megloc_kapture.preprocessing.frames import carry_points
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.local_features import check_size, extract_all, read_mask
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.preprocessing import ClassMasks, ProcessedFrame
+from megloc_kapture.stages.preprocessing import ClassMasks, PreprocessingOptions, ProcessedFrame
 from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform, check_camera
 
 
@@ -108,8 +108,8 @@ class QueryImage(ProcessedFrame):
     def __init__(
         self, query: Query, options: PipelineOptions, classes: Callable[[], ClassMasks | None]
     ) -> None:
-        frame = FrameOptions() if query.features else options.preprocessing
-        plan = plan_frame(query.camera, frame)
+        preprocessing = PreprocessingOptions() if query.features else options.preprocessing
+        plan = preprocessing.plan(query.camera)
         super().__init__(query.name, plan, query.read_image, self._own_mask, classes)
         self.query, self.camera = query, plan.processed
         self._mask_margin_px = options.mask_margin_px

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.cameras import (
@@ -32,7 +31,7 @@ from megloc_kapture.geometry.cameras import (
     with_two_focals,
 )
 from megloc_kapture.io.colmap import undistorted_pinhole
-from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Options
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera
 
 # check every 16th pixel: points between two valid ones are valid, as distortion changes slowly
 _CHECKED_EVERY = 16
@@ -147,20 +146,6 @@ def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
 _SIDE_STEP_PX = 8  # sides of preprocessed images are multiples of this
 
 
-class FrameOptions(Options):
-    """Options for size and projection of the images, which by default do not change."""
-
-    max_size_px: int | None = Field(
-        default=None,
-        gt=0,
-        description="longer side of reduced images; unset: original size",
-    )
-    upscale: bool = Field(
-        default=False, description="also enlarge images with a longer side below max_size_px"
-    )
-    undistort: bool = Field(default=False, description="remove lens distortion")
-
-
 @dataclass(frozen=True, slots=True)
 class FramePlan:
     """A camera before and after pre-processing; the pose does not change.
@@ -196,19 +181,21 @@ class FramePlan:
         return replace(camera, focal_deviation=estimated.focal_deviation)
 
 
-def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
-    """Plan size and projection of a camera's images."""
-    lens = camera
-    if options.undistort:
-        lens = undistorted_camera(camera)
+def plan_frame(
+    camera: Camera,
+    *,
+    max_size_px: int | None = None,
+    upscale: bool = False,
+    undistort: bool = False,
+) -> FramePlan:
+    """Plan size and projection of a camera's images, which by default do not change."""
+    lens = undistorted_camera(camera) if undistort else camera
     warps = not same_lens(camera, lens)
     width, height = lens.width, lens.height
-    if options.max_size_px is not None:
-        width, height = fitted_size(
-            lens.width, lens.height, options.max_size_px, upscale=options.upscale
-        )
+    if max_size_px is not None:
+        width, height = fitted_size(lens.width, lens.height, max_size_px, upscale=upscale)
     processed = scaled_camera(lens, width, height)
-    if warps or options.max_size_px is not None:
+    if warps or max_size_px is not None:
         cropped_width, cropped_height = cropped_size(width, height)
         processed = replace(processed, width=cropped_width, height=cropped_height)
     shrink = max(lens.width / width, lens.height / height)

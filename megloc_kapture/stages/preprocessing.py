@@ -25,7 +25,6 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_
 from megloc_kapture.plugin_loading import Placement, checked_array, load_chosen
 from megloc_kapture.plugins import SEGMENTERS, PluginChoice, Segmenter
 from megloc_kapture.preprocessing.frames import (
-    FrameOptions,
     FramePlan,
     plan_frame,
     processed_image,
@@ -274,8 +273,27 @@ CLASSES, CLASSES_FILE = "classes", "classes.json"
 _log = logging.getLogger(__name__)
 
 
-class PreprocessingOptions(FrameOptions):
+class PreprocessingOptions(Options):
+    """Options for size, projection and masks of the images, which by default do not change."""
+
+    max_size_px: int | None = Field(
+        default=None,
+        gt=0,
+        description="longer side of reduced images; unset: original size",
+    )
+    upscale: bool = Field(
+        default=False, description="also enlarge images with a longer side below max_size_px"
+    )
+    undistort: bool = Field(default=False, description="remove lens distortion")
     masks: MaskOptions = MaskOptions()
+
+    def plan(self, camera: Camera) -> FramePlan:
+        return plan_frame(
+            camera,
+            max_size_px=self.max_size_px,
+            upscale=self.upscale,
+            undistort=self.undistort,
+        )
 
 
 def _process(
@@ -382,11 +400,11 @@ def preprocess_images(
     }
 
 
-def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
+def _plans(data: KaptureData, options: PreprocessingOptions) -> dict[str, FramePlan]:
     plans: dict[str, FramePlan] = {}
     for (_, sensor_id), image in sorted(data.records_camera.items()):
         if sensor_id not in plans:
-            plans[sensor_id] = plan_frame(data.camera_of(image), options)
+            plans[sensor_id] = options.plan(data.camera_of(image))
     return plans
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +20,6 @@ from megloc_kapture.geometry.cameras import with_two_focals
 from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.preprocessing import frames as module
 from megloc_kapture.preprocessing.frames import (
-    FrameOptions,
     FramePlan,
     carry_points,
     cropped_size,
@@ -34,8 +34,8 @@ from megloc_kapture.preprocessing.frames import (
 )
 from megloc_kapture.values import Camera
 
-UNDISTORT = FrameOptions(undistort=True)
-SMALL = FrameOptions(undistort=True, max_size_px=200)
+UNDISTORT: dict[str, Any] = {"undistort": True}
+SMALL: dict[str, Any] = {"undistort": True, "max_size_px": 200}
 FOLDING = Camera("SIMPLE_RADIAL", 480, 360, (240.0, 240.0, 180.0, -0.4))
 
 
@@ -97,7 +97,7 @@ def test_cameras_are_scaled_with_their_images(camera: Camera, size: tuple[int, i
 
 def test_an_estimated_camera_is_that_of_the_original_image() -> None:
     original = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 321.0, 243.0, 0.02))
-    plan = plan_frame(original, FrameOptions(max_size_px=320))
+    plan = plan_frame(original, max_size_px=320)
     estimated = Camera("SIMPLE_RADIAL", 320, 240, (275.0, 163.5, 119.5, 0.03), focal_deviation=0.01)
     expected = Camera("SIMPLE_RADIAL", 640, 480, (550.0, 327.0, 239.0, 0.03), focal_deviation=0.01)
     camera = plan.original_of(estimated)
@@ -108,7 +108,7 @@ def test_an_estimated_camera_is_that_of_the_original_image() -> None:
 def test_cropping_keeps_pixels_and_shrinking_averages_them() -> None:
     image = painted(lambda x, y: x + y / 2, 123, 61)
     camera = Camera("SIMPLE_RADIAL", 123, 61, (100.0, 60.0, 30.0, 0.1))
-    plan = plan_frame(camera, FrameOptions(max_size_px=1600))
+    plan = plan_frame(camera, max_size_px=1600)
     assert plan.processed == replace(camera, width=120, height=56)
     np.testing.assert_array_equal(processed_image(image, plan), image[:56, :120])
     board = painted(lambda x, y: 255.0 * ((np.floor(x) + np.floor(y)) % 2), 64, 64)
@@ -117,7 +117,7 @@ def test_cropping_keeps_pixels_and_shrinking_averages_them() -> None:
 
 def test_images_are_unchanged_by_default() -> None:
     camera = CAMERAS["OPENCV"]
-    plan = plan_frame(camera, FrameOptions())
+    plan = plan_frame(camera)
     assert plan.processed == camera and not plan.changes_pixels
     mask = np.ones((camera.height, camera.width), bool)
     assert processed_mask(mask, plan) is mask
@@ -127,7 +127,7 @@ def test_images_are_unchanged_by_default() -> None:
 def test_resized_masks_have_the_value_under_each_pixel_centre(max_size_px: int) -> None:
     mask = np.random.default_rng(0).random((61, 123)) > 0.5
     camera = Camera("PINHOLE", 123, 61, (100.0, 100.0, 60.0, 30.0))
-    plan = plan_frame(camera, FrameOptions(max_size_px=max_size_px, upscale=True))
+    plan = plan_frame(camera, max_size_px=max_size_px, upscale=True)
     result = processed_mask(mask, plan)
     assert result.shape == (plan.processed.height, plan.processed.width)
     rows, columns = np.indices(result.shape)
@@ -165,7 +165,7 @@ def undistorted_by_opencv(image: NDArray[np.uint8], plan: FramePlan) -> NDArray[
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_undistorted_images_equal_opencv(model: str) -> None:
-    image, plan = cloudy(), plan_frame(CAMERAS[model], UNDISTORT)
+    image, plan = cloudy(), plan_frame(CAMERAS[model], **UNDISTORT)
     expected = undistorted_by_opencv(image, plan).astype(int)
     difference = np.abs(processed_image(image, plan) - expected)[3:-3, 3:-3]
     assert difference.max() <= 4
@@ -182,7 +182,7 @@ def test_undistorted_images_equal_colmap(model: str, monkeypatch: pytest.MonkeyP
     options.blank_pixels = 0.0
     picture, camera = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(image), theirs)
     monkeypatch.setattr(module, "_SIDE_STEP_PX", 1)
-    plan = plan_frame(distorted, UNDISTORT)
+    plan = plan_frame(distorted, **UNDISTORT)
     assert plan.processed.model == "PINHOLE"
     assert (plan.processed.width, plan.processed.height) == (camera.width, camera.height)
     np.testing.assert_allclose(plan.processed.params, camera.params, rtol=1e-12)
@@ -197,11 +197,11 @@ def test_undistorted_images_equal_colmap(model: str, monkeypatch: pytest.MonkeyP
 
 
 def test_pixels_outside_the_other_image_are_nan() -> None:
-    pixels = plan_frame(CAMERAS["OPENCV"], UNDISTORT)
+    pixels = plan_frame(CAMERAS["OPENCV"], **UNDISTORT)
     corner = carry_points(pixels.original, pixels.processed, np.array([[0.5, 0.5], [240.0, 180.0]]))
     assert np.isnan(corner[0]).all() and np.isfinite(corner[1]).all()
     odd = replace(CAMERAS["PINHOLE"], width=643)
-    cropped = plan_frame(odd, FrameOptions(max_size_px=1600))
+    cropped = plan_frame(odd, max_size_px=1600)
     columns = np.array([[642.5, 100.0], [639.5, 100.0]])
     edge = carry_points(cropped.original, cropped.processed, columns)
     assert np.isnan(edge[0]).all()
@@ -210,7 +210,7 @@ def test_pixels_outside_the_other_image_are_nan() -> None:
 
 def test_pixels_beyond_the_fold_of_a_model_are_empty() -> None:
     """k = -0.4 bends rays beyond tan = 0.91 back, to a second copy of the image."""
-    plan = plan_frame(FOLDING, FrameOptions(undistort=True))
+    plan = plan_frame(FOLDING, undistort=True)
     reached = reached_region(plan)
     assert reached is not None
     fx, fy, cx, cy = plan.processed.params
@@ -228,7 +228,7 @@ def test_pixels_beyond_the_fold_of_a_model_are_empty() -> None:
 
 def test_a_fisheye_beyond_half_a_sphere_is_undistorted() -> None:
     camera = Camera("OPENCV_FISHEYE", 400, 400, (112.0, 112.0, 200.0, 200.0, 0.0, 0.0, 0.0, 0.0))
-    plan = plan_frame(camera, FrameOptions(undistort=True))
+    plan = plan_frame(camera, undistort=True)
     off_axis = np.column_stack([200.0 + 112.0 * np.radians([101, 30]), [200.0, 200.0]])
     behind, inside = carry_points(plan.original, plan.processed, off_axis)
     # 101 degrees off the axis is behind a pinhole
@@ -246,16 +246,16 @@ def test_zero_distortion_changes_only_the_model(model: str) -> None:
     points = points_seen()
     np.testing.assert_allclose(px_from_cam(pinhole, points), px_from_cam(camera, points))
     for same in (CAMERAS["SIMPLE_PINHOLE"], pinhole):
-        plan = plan_frame(same, FrameOptions(undistort=True))
+        plan = plan_frame(same, undistort=True)
         assert plan.processed == same and not plan.changes_pixels
 
 
 @pytest.mark.parametrize(("model", "options"), [("OPENCV", UNDISTORT), ("FOV", SMALL)])
-def test_masks_are_undistorted_like_images(model: str, options: FrameOptions) -> None:
+def test_masks_are_undistorted_like_images(model: str, options: dict[str, Any]) -> None:
     distorted = CAMERAS[model]
     y, x = np.indices((distorted.height, distorted.width)) + 0.5
     disc = np.hypot(x - 300, y - 150) < 60
-    plan = plan_frame(distorted, options)
+    plan = plan_frame(distorted, **options)
     mask = processed_mask(disc, plan)
     image = processed_image(np.repeat(disc[..., None] * np.uint8(255), 3, axis=2), plan)
     sure = (image[..., 0] < 20) | (image[..., 0] > 235)
@@ -266,7 +266,7 @@ def test_masks_are_undistorted_like_images(model: str, options: FrameOptions) ->
 def test_fine_detail_is_averaged_not_aliased() -> None:
     camera = CAMERAS["SIMPLE_RADIAL"]
     stripes = painted(lambda x, y: 255.0 * (np.floor(x) % 2))
-    plan = plan_frame(camera, FrameOptions(undistort=True, max_size_px=120))
+    plan = plan_frame(camera, undistort=True, max_size_px=120)
     result = processed_image(stripes, plan)[2:-2, 2:-2].astype(float)
     assert plan.shrink > 4
     assert np.abs(result - 127.5).max() < 45
