@@ -24,7 +24,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import keep_unit
-from megloc_kapture.io.files import read_text
+from megloc_kapture.io.files import reading
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.pipeline.kapture_map import restrictions_beside
@@ -109,16 +109,17 @@ def report_lines(root: Path) -> list[str]:
     path = root / "reconstruction" / REPORT_FILE
     if not path.is_file():
         return []
-    report = json.loads(read_text(path))
-    rows: list[tuple[str, object, object]] = [
-        ("", "points", "observations"),
-        ("before", report["points_before"], report["observations_before"]),
-        *(
-            (step["name"].replace("_", " "), f"-{step['points']}", f"-{step['observations']}")
-            for step in report["filters"]
-        ),
-        ("after", report["points_after"], report["observations_after"]),
-    ]
+    with reading(path, "a report of map refinement"):
+        report = json.loads(path.read_text())
+        rows: list[tuple[str, object, object]] = [
+            ("", "points", "observations"),
+            ("before", report["points_before"], report["observations_before"]),
+            *(
+                (step["name"].replace("_", " "), f"-{step['points']}", f"-{step['observations']}")
+                for step in report["filters"]
+            ),
+            ("after", report["points_after"], report["observations_after"]),
+        ]
     return [f"{name:22s}{points!s:>10s}{seen!s:>14s}" for name, points, seen in rows]
 
 
