@@ -294,9 +294,11 @@ def match_counts_path(features_dir: Path, type_name: str) -> Path:
 
 def read_match_counts(
     features_dir: Path, type_name: str, *, missing_ok: bool = False
-) -> list[PairCount]:
+) -> dict[tuple[str, str], PairCount]:
+    """Read the counts of all pairs, by image and other image."""
     path = match_counts_path(features_dir, type_name)
-    return read_records(path, PairCount, missing_ok=missing_ok)
+    rows = read_records(path, PairCount, missing_ok=missing_ok)
+    return {(row.image, row.other): row for row in rows}
 
 
 def append_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:

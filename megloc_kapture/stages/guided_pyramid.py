@@ -33,7 +33,7 @@ from megloc_kapture.io.kapture import (
     read_pairs,
 )
 from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
-from megloc_kapture.io.tables import PairCount, read_match_counts
+from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
@@ -492,7 +492,7 @@ class _AgainStage(PipelineStage):
         counts: dict[str, float] = {}
         for extractor in options.make_extractors():
             name = extractor.name
-            rows = _match_counts(work.path(self.matches), name)
+            rows = read_match_counts(work.path(self.matches), name)
             if second_matcher is not None:
                 best = best_pairs(
                     {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
@@ -503,7 +503,7 @@ class _AgainStage(PipelineStage):
                 matched = match_pairs(
                     first, second, again, name, second_matcher, verification, out, work=work
                 )
-                rows |= _match_counts(out, name)
+                rows |= read_match_counts(out, name)
                 counts |= {f"{name} second {key}": count for key, count in matched.items()}
             if options.uses_pyramid():
                 matcher, margin_px = options.make_matcher(name), options.mask_margin_px
@@ -518,10 +518,6 @@ class _AgainStage(PipelineStage):
                 retried = retry(pairs, name, method, out, num_found=num_found, work=work)
                 counts |= {f"{name} {key}": count for key, count in retried.items()}
         return counts
-
-
-def _match_counts(features_dir: Path, local_type: str) -> dict[_Pair, PairCount]:
-    return {(row.image, row.other): row for row in read_match_counts(features_dir, local_type)}
 
 
 def _named(pairs: Sequence[ImagePair]) -> set[_Pair]:

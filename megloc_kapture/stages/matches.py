@@ -149,8 +149,7 @@ def match_pairs(
     writer = MatchesWriter(output, local_type, orphan=True)
     counts: dict[tuple[str, str], PairCount] = {}
     if work.resume:
-        known = read_match_counts(output, local_type, missing_ok=True)
-        counts = {(row.image, row.other): row for row in known}
+        counts = read_match_counts(output, local_type, missing_ok=True)
     todo = work.unfinished(ordered, lambda pair: pair in writer and pair in counts)
     jobs: list[_Job] = []
     for image, group in groupby(todo, key=itemgetter(0)):

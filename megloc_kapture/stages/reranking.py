@@ -137,7 +137,7 @@ def _stored(
     if by != "coverage":
         rows = read_match_counts(matches_dir, local_type)
         counts = {
-            (row.image, row.other): row.matches if by == "matches" else row.verified for row in rows
+            pair: row.matches if by == "matches" else row.verified for pair, row in rows.items()
         }
         return lambda image, other: counts.get((image, other), 0)
     matches, none = query.matches(local_type), np.zeros(0, np.int64)

@@ -137,7 +137,7 @@ class FindPoses(PipelineStage):
             is_doubtful = data.sensors[sensor].name == ""
             photographs.append(Photograph(image, sensor, data.camera_of(image), px, is_doubtful))
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
-        putative = {(pair.image, pair.other): pair.matches for pair in counts}
+        putative = {pair: count.matches for pair, count in counts.items()}
         reader = mapping.matches(local_type)
         matches = matches_of(reader, images, matched_pairs(reader, images, putative.keys()))
         for (i, j), rows in list(matches.items()):

@@ -140,10 +140,8 @@ def check_second_matches(workspace: Workspace) -> None:
     """Check that matches of the second matcher replace those of the best pairs."""
     for kind, part in (("query", QUERY_MATCHES), ("mapping", MAPPING_MATCHES)):
         again = workspace.path(f"pyramid/{kind}")
-        first = {
-            (row.image, row.other): row for row in read_match_counts(workspace.path(part), TYPE)
-        }
-        second = {(row.image, row.other): row for row in read_match_counts(again, TYPE)}
+        first = read_match_counts(workspace.path(part), TYPE)
+        second = read_match_counts(again, TYPE)
         counts = {pair: row.verified for pair, row in first.items()}
         best = best_pairs(counts, 2, of_both=kind == "mapping")
         assert set(second) == set(best) and len(best) < len(first)

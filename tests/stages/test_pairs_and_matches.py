@@ -371,7 +371,7 @@ def test_all_matches_or_verified_matches_are_stored(world: Any, tmp_path: Path) 
     swapped, _ = everything.read(image, query)  # stored with the smaller name first
     np.testing.assert_array_equal(swapped, matches[:, ::-1])
     # the table counts the matches of each pair before and after verification
-    counts = read_match_counts(tmp_path / "verified", "rootsift")
+    counts = read_match_counts(tmp_path / "verified", "rootsift").values()
     for count in counts:
         assert count.verified == len(verified.read(count.image, count.other)[0])
         assert count.matches == len(everything.read(count.image, count.other)[0])
