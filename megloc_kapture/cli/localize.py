@@ -36,7 +36,7 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.matches import candidates_of
 from megloc_kapture.stages.stage import LOCALIZED
 
 _log = logging.getLogger(__name__)
@@ -89,7 +89,7 @@ class Localize(Reading, Deciding, Common):
         kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
         _check_consistent(kapture_map, self.input, force=self.force)
         options = self.options()
-        given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
+        given = None if self.pairs is None else candidates_of(read_pairs(self.pairs))
         # fail before the first query and before anything is written
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=self.track)

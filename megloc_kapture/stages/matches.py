@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from itertools import combinations, groupby
@@ -401,14 +401,12 @@ def cached_features(folder: KaptureFolder, local_type: str, image: str) -> Featu
     return Features.of(camera, keypoints.read(image), descriptors.read(image))
 
 
-def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each query, sorted by name, with its candidates, best first."""
-    candidates: dict[str, list[ImagePair]] = {}
-    for pair in pairs:
-        candidates.setdefault(pair.query, []).append(pair)
-    for query in sorted(candidates):
-        best_first = sorted(candidates[query], key=lambda pair: (-pair.score, pair.map))
-        yield query, [pair.map for pair in best_first]
+def candidates_of(pairs: Iterable[ImagePair]) -> dict[str, list[str]]:
+    """Return the candidates of each query, best first; queries are sorted by name."""
+    candidates: dict[str, list[str]] = {}
+    for pair in sorted(pairs, key=lambda pair: (pair.query, -pair.score, pair.map)):
+        candidates.setdefault(pair.query, []).append(pair.map)
+    return candidates
 
 
 # options that determine the local feature types and their matching

@@ -35,7 +35,7 @@ from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
 from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import unreadable_queries, write_localized
-from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.matches import candidates_of
 from megloc_kapture.stages.scene import (
     KaptureScene,
     Unit,
@@ -291,7 +291,7 @@ def localize_from_matches(
     for a temporary map index.
     """
     ranker = options.make_ranker(work.placement)
-    candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
+    candidates = candidates_of(pairs)
     units = query_units(query.read(), rigs=options.rigs)
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}
     measured = {name: with_noise(map_folder, index) for name, index in read.items()}
@@ -368,5 +368,5 @@ def first_candidates(
 ) -> dict[str, tuple[str, RigidTransform]]:
     """Map each query to its best retrieved map image and that image's pose."""
     poses = mapping.read().poses()
-    best = {query: images[0] for query, images in iterate_candidates(pairs)}
+    best = {query: images[0] for query, images in candidates_of(pairs).items()}
     return {query: (image, poses[image]) for query, image in best.items() if image in poses}

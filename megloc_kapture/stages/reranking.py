@@ -18,7 +18,7 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, writ
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.retrieval.search import greedy_coverage
-from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
+from megloc_kapture.stages.matches import VerifiedMatches, candidates_of
 from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
@@ -124,7 +124,7 @@ def reranked(
     counted_types = options.counted_types(local_types)
     stored = [_stored(query, matches, name, options.by) for name in counted_types]
     ranking = []
-    for image, candidates in iterate_candidates(pairs):
+    for image, candidates in candidates_of(pairs).items():
         of_types = [[matched(image, other) for other in candidates] for matched in stored]
         for place, (at, count) in enumerate(zip(*rerank(of_types, options), strict=True)):
             ranking.append(ImagePair(image, candidates[at], count + 1.0 / (2.0 + place)))

@@ -26,7 +26,7 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.stages.matches import best_pairs, iterate_candidates
+from megloc_kapture.stages.matches import best_pairs, candidates_of
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.stage import MAPPING_MATCHES, QUERY_MATCHES
 from megloc_kapture.values import RigidTransform
@@ -161,7 +161,7 @@ def test_a_fallback_is_the_pose_of_the_best_reranked_candidate(scene: Path, tmp_
     ]  # fmt: skip
     workspace, localizer = both(scene, tmp_path / "workspace", *sets)
     first = [
-        {name: images[0] for name, images in iterate_candidates(read_pairs(workspace.path(pairs)))}
+        {name: each[0] for name, each in candidates_of(read_pairs(workspace.path(pairs))).items()}
         for pairs in ("pairs/query_candidates.txt", "pairs/query.txt")
     ]
     assert first[0] != first[1]

@@ -39,8 +39,8 @@ from megloc_kapture.stages.image_pairs import (
 from megloc_kapture.stages.matches import (
     VerifiedMatches,
     best_pairs,
+    candidates_of,
     check_given_poses,
-    iterate_candidates,
     match_all,
     match_pairs,
 )
@@ -432,7 +432,7 @@ def test_candidates_are_sorted_by_score_and_name() -> None:
         ImagePair("q1", "m2", 0.9),
         ImagePair("q1", "m1", 0.5),
     ]
-    assert list(iterate_candidates(pairs)) == [("q1", ["m2", "m1", "m3"]), ("q2", ["m1"])]
+    assert list(candidates_of(pairs).items()) == [("q1", ["m2", "m1", "m3"]), ("q2", ["m1"])]
 
 
 def test_a_wrong_given_pose_is_a_warning(
