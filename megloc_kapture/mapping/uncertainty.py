@@ -11,7 +11,6 @@ distortion.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,45 +101,34 @@ class UncertaintyOptions(Options):
     )
 
 
-@dataclass(frozen=True, eq=False)
-class ObservedPoints:
-    """Points float64 (N, 3) with observations (O,), sorted by point."""
-
-    xyz: Floats
-    point_ids: NDArray[np.int64]
-    image_ids: NDArray[np.int32]
-    cameras: Sequence[Camera]
-    cams_from_world: Sequence[RigidTransform]
-
-    def by_image(self) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Yield each observing image with its rows of observations, ascending."""
-        ids = self.image_ids
-        # numpy sorts integers of 16 bits in linear time
-        narrow = ids.astype(np.uint16) if len(self.cameras) < 1 << 16 else ids
-        order = np.argsort(narrow, kind="stable")
-        begin = 0
-        ends = np.cumsum(np.bincount(ids, minlength=len(self.cameras)))
-        for image, end in enumerate(ends.tolist()):
-            if end > begin:
-                yield image, order[begin:end]
-            begin = end
+def rows_by_image(
+    image_ids: NDArray[np.int32], num_images: int
+) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Yield each image with observations, and their rows in ``image_ids`` (O,), ascending."""
+    # numpy sorts integers of 16 bits in linear time
+    narrow = image_ids.astype(np.uint16) if num_images < 1 << 16 else image_ids
+    order = np.argsort(narrow, kind="stable")
+    begin = 0
+    ends = np.cumsum(np.bincount(image_ids, minlength=num_images))
+    for image, end in enumerate(ends.tolist()):
+        if end > begin:
+            yield image, order[begin:end]
+        begin = end
 
 
-def mean_depths(observed: ObservedPoints) -> Floats:
-    """Return mean depths (N,) of the points in their images; NaN without observations."""
-    poses = observed.cams_from_world
-    axes = np.array([pose.rotation_matrix()[2] for pose in poses]).reshape(-1, 3)
-    offsets = np.array([pose.translation[2] for pose in poses])
-    points, images = observed.xyz[observed.point_ids], observed.image_ids
-    depths = np.einsum("oi,oi->o", axes[images], points) + offsets[images]
+def mean_depths(
+    xyz: Floats,
+    point_ids: NDArray[np.int64],
+    image_ids: NDArray[np.int32],
+    cams_from_world: Sequence[RigidTransform],
+) -> Floats:
+    """Return mean depths (N,) of the points in their images; NaN without observations (O,)."""
+    axes = np.array([pose.rotation_matrix()[2] for pose in cams_from_world]).reshape(-1, 3)
+    offsets = np.array([pose.translation[2] for pose in cams_from_world])
+    depths = np.einsum("oi,oi->o", axes[image_ids], xyz[point_ids]) + offsets[image_ids]
     with np.errstate(invalid="ignore"):
-        sums = np.bincount(observed.point_ids, depths, minlength=len(observed.xyz))
-        return np.asarray(sums / track_lengths(observed))
-
-
-def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
-    """Return the number of observations (N,) of each point."""
-    return np.bincount(observed.point_ids, minlength=len(observed.xyz))
+        sums = np.bincount(point_ids, depths, minlength=len(xyz))
+        return np.asarray(sums / np.bincount(point_ids, minlength=len(xyz)))
 
 
 def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) -> Mask:

@@ -36,14 +36,13 @@ from megloc_kapture.mapping.depth import (
     compare_with_depth,
 )
 from megloc_kapture.mapping.uncertainty import (
-    ObservedPoints,
     UncertaintyOptions,
     left_with_too_few,
     mean_depths,
     point_covariances,
     point_deviations,
+    rows_by_image,
     too_uncertain,
-    track_lengths,
 )
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
@@ -77,6 +76,7 @@ class MapSelection:
         poses = self.data.poses()
         observing = {image for seen in types for image in seen.image_names}
         self.images = sorted(observing.intersection(poses))
+        self.cameras = [self.data.camera_of(image) for image in self.images]
         self.cams_from_world = [poses[image] for image in self.images]
         row_of = {image: row for row, image in enumerate(self.images)}
         rows = [
@@ -84,38 +84,26 @@ class MapSelection:
             for seen in types
         ]
         self._sizes = [len(seen) for seen in types]
-        point_ids = _joined([seen.point_ids for seen in types], np.int64)
-        image_ids = _joined(rows, np.int32)
-        # each type is sorted by point; sort all types together by point
-        self._order = np.argsort(point_ids, kind="stable")
-        self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
+        self.point_ids = _joined([seen.point_ids for seen in types], np.int64)
+        self.image_ids = _joined(rows, np.int32)
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
         self.kept = self.image_ids >= 0
         # by filter: the points or observations that it could judge, and its removals
         self.reports: list[dict[str, Any]] = []
         self._covariances: Floats | None = None
 
-    def observed(self) -> tuple[ObservedPoints, NDArray[np.int64]]:
-        """Return the kept observations and their rows."""
-        rows = np.flatnonzero(self.kept)
-        cameras = [self.data.camera_of(image) for image in self.images]
-        observed = ObservedPoints(
-            self.xyz, self.point_ids[rows], self.image_ids[rows], cameras, self.cams_from_world
-        )
-        return observed, rows
-
     def covariances(self) -> Floats:
         """Return covariances (N, 6) from the kept observations; NaN where undetermined."""
         if self._covariances is None:
-            observed, _ = self.observed()
-            self._covariances = point_covariances(
-                observed.xyz,
-                observed.point_ids,
-                observed.image_ids,
-                observed.cameras,
-                observed.cams_from_world,
-            )
+            ids = self.point_ids[self.kept], self.image_ids[self.kept]
+            views = self.cameras, self.cams_from_world
+            self._covariances = point_covariances(self.xyz, *ids, *views)
         return self._covariances
+
+    def depths(self) -> Floats:
+        """Return mean depths (N,) of the points in their images, from the kept observations."""
+        ids = self.point_ids[self.kept], self.image_ids[self.kept]
+        return mean_depths(self.xyz, *ids, self.cams_from_world)
 
     def drop_observations(self, name: str, dropped: Mask, checked: int) -> None:
         """Drop observations (O,), and points left with too few."""
@@ -145,10 +133,8 @@ class MapSelection:
 
     def observations(self) -> dict[str, Observations]:
         """Return the kept observations by type, with renumbered points."""
-        kept = np.empty_like(self.kept)
-        kept[self._order] = self.kept
         number = np.cumsum(self.kept_points) - 1
-        parts = np.split(kept, np.cumsum(self._sizes)[:-1]) if self._sizes else []
+        parts = np.split(self.kept, np.cumsum(self._sizes)[:-1]) if self._sizes else []
         return {
             name: replace(
                 seen,
@@ -242,34 +228,33 @@ def _verify_depth(
     if not with_depth:
         return
     covariances = selection.covariances()
-    observed, placed = selection.observed()
-    once = track_lengths(observed)[observed.point_ids] == 1
-    lifted = once & np.isin(observed.image_ids, list(with_depth))
+    kept, point_ids = selection.kept, selection.point_ids
+    once = np.bincount(point_ids[kept], minlength=len(selection.xyz))[point_ids] == 1
+    lifted = kept & once & np.isin(selection.image_ids, list(with_depth))
+    triangulated = np.flatnonzero(kept & ~lifted)
     rows_of = [
-        (image, chosen)
-        for image, rows in observed.by_image()
-        if image in with_depth and len(chosen := rows[~lifted[rows]])
+        (image, triangulated[rows])
+        for image, rows in rows_by_image(selection.image_ids[triangulated], len(selection.images))
+        if image in with_depth
     ]
 
     def job(image: int, rows: NDArray[np.int64]) -> tuple[str, Floats, Floats]:
-        points = observed.point_ids[rows]
-        return selection.images[image], observed.xyz[points], covariances[points]
+        points = point_ids[rows]
+        return selection.images[image], selection.xyz[points], covariances[points]
 
-    dropped = np.zeros(len(selection.kept), dtype=bool)
+    dropped = np.zeros(len(kept), dtype=bool)
     num_checked = 0
     jobs = (job(image, rows) for image, rows in rows_of)
     compare = partial(_compare, folder, options)
     results = work.map(compare, jobs, "depth", len(rows_of))
     for (_, rows), (contradicted, checked) in zip(rows_of, results, strict=True):
-        dropped[placed[rows[contradicted]]] = True
+        dropped[rows[contradicted]] = True
         num_checked += checked
     if lifted.any():
         scans, neighbours = _scans(selection, sorted(with_depth), restrictions)
         rows = np.flatnonzero(lifted)
-        votes, judged = _votes_of_other_scans(
-            selection, observed, rows, scans, neighbours, options, work
-        )
-        dropped[placed[rows[votes < 0]]] = True
+        votes, judged = _votes_of_other_scans(selection, rows, scans, neighbours, options, work)
+        dropped[rows[votes < 0]] = True
         num_checked += int(judged.sum())
     selection.drop_observations("depth", dropped, num_checked)
 
@@ -300,21 +285,22 @@ def _scans(
 
 def _votes_of_other_scans(
     selection: MapSelection,
-    observed: ObservedPoints,
     lifted: NDArray[np.int64],
     scans: Sequence[Sequence[int]],
     neighbours: Sequence[Collection[int]],
     options: DepthVerificationOptions,
     work: Work,
 ) -> tuple[NDArray[np.int64], Mask]:
-    """Return the sums of votes (L,) of nearby scans, and the lifted points that they could judge.
+    """Return the sums of votes (L,) of nearby scans on lifted points, and those they could judge.
+
+    ``lifted`` (L,) are the rows of the points' observations.
 
     A scan votes +1 if it has a surface at the point, -1 if it sees through the point.
     """
-    scan_of = np.full(len(observed.cameras), -1)
+    scan_of = np.full(len(selection.images), -1)
     for number, images in enumerate(scans):
         scan_of[images] = number
-    own_scan = scan_of[observed.image_ids[lifted]]
+    own_scan = scan_of[selection.image_ids[lifted]]
     order = np.argsort(own_scan, kind="stable")
     rows_of_scan = np.split(order, np.searchsorted(own_scan[order], np.arange(1, len(scans))))
     judged_rows: list[list[NDArray[np.int64]]] = [[] for _ in scans]
@@ -326,9 +312,9 @@ def _votes_of_other_scans(
         for images, parts in zip(scans, judged_rows, strict=True)
         if parts
     ]
-    points = observed.point_ids[lifted]
-    sigmas = depth_noise(mean_depths(observed)[points], options.noise)
-    jobs = ((images, observed.xyz[points[rows]], sigmas[rows]) for images, rows in asked)
+    points = selection.point_ids[lifted]
+    sigmas = depth_noise(selection.depths()[points], options.noise)
+    jobs = ((images, selection.xyz[points[rows]], sigmas[rows]) for images, rows in asked)
     judge = partial(_judge, selection.source, options)
     votes, judged = np.zeros(len(lifted), np.int64), np.zeros(len(lifted), bool)
     results = work.map(judge, jobs, "depth of other scans", len(asked))
@@ -398,8 +384,7 @@ def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None
     deviations = point_deviations(selection.covariances())[:, 2]
     # dropped points do not count in the map's median
     deviations = np.where(selection.kept_points, deviations, np.nan)
-    depths = mean_depths(selection.observed()[0])
-    rejected = too_uncertain(deviations, depths, max_robust_sigmas)
+    rejected = too_uncertain(deviations, selection.depths(), max_robust_sigmas)
     selection.drop_points("uncertainty", rejected, int(np.isfinite(deviations).sum()))
 
 

@@ -14,7 +14,6 @@ from scipy.stats import median_abs_deviation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.mapping.uncertainty import (
-    ObservedPoints,
     left_with_too_few,
     mean_depths,
     point_covariances,
@@ -186,9 +185,8 @@ def test_images_of_the_same_centre_determine_no_points() -> None:
 def test_mean_depths_are_those_of_the_observing_images() -> None:
     poses = [RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, z)) for z in (0.0, 1.0, 1.0)]
     xyz = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 5.0], [0.0, 0.0, 1.0]])
-    images = np.arange(3, dtype=np.int32)
-    observed = ObservedPoints(xyz, np.array([0, 0, 1]), images, [FISHEYE] * 3, poses)
-    np.testing.assert_allclose(mean_depths(observed), [3.5, 6.0, np.nan])
+    depths = mean_depths(xyz, np.array([0, 0, 1]), np.arange(3, dtype=np.int32), poses)
+    np.testing.assert_allclose(depths, [3.5, 6.0, np.nan])
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1e3), st.floats(0.5, 4.0))
