@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.dataset_tables import read_unreadable, write_unreadable
+from megloc_kapture.io.dataset_tables import write_unreadable
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import (
@@ -138,11 +138,6 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     write_sensors(query, replace(data, records_camera=records))
     write_unreadable(tables, reasons)
     return reasons
-
-
-def unreadable_queries(tables: Path) -> Iterator[Failure]:
-    for name, reason in read_unreadable(tables).items():
-        yield unreadable_image(name, reason)
 
 
 def unreadable_image(name: str, reason: str) -> Failure:

@@ -70,8 +70,7 @@ class PoseRefinementOptions(Options):
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
         """Select refiners, in this order; those already in the options keep their settings."""
-        chosen = chosen_by_name(self.by, names)
-        return PoseRefinementOptions.model_validate({**self.model_dump(), "by": chosen})
+        return PoseRefinementOptions.model_validate({"by": chosen_by_name(self.by, names)})
 
     def refines(self) -> bool:
         return bool(self.by)
@@ -107,14 +106,10 @@ class MapRefiners:
 
     @cached_property
     def _by_frame(self) -> dict[str, ReferenceImages]:
-        poses = self.map.read().poses()
-        images = sorted(poses)
-        return {
-            self._restrictions.frame(images[members[0]]): ReferenceImages(
-                {images[member]: poses[images[member]] for member in members}
-            )
-            for members in self._restrictions.frames(images)
-        }
+        poses_of: dict[str, dict[str, RigidTransform]] = {}
+        for image, pose in self.map.read().poses().items():
+            poses_of.setdefault(self._restrictions.frame(image), {})[image] = pose
+        return {frame: ReferenceImages(poses) for frame, poses in poses_of.items()}
 
     def _frame(self, pose: Pose) -> str:
         return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import chain
+from itertools import chain, starmap
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, read_unreadable
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
@@ -34,7 +34,7 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
 from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import unreadable_queries, write_localized
+from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.matches import candidates_of
 from megloc_kapture.stages.scene import (
     KaptureScene,
@@ -356,7 +356,7 @@ class LocalizeQueries(PipelineStage):
         return write_localized(
             work.out / self.poses(),
             work.folder(QUERY),
-            chain(results, unreadable_queries(tables)),
+            chain(results, starmap(unreadable_image, read_unreadable(tables).items())),
             fallback=options.fallback,
             first_candidates=first_candidates(pairs, work.folder(MAPPING)),
             timing=work.out / TIMING,
