@@ -43,8 +43,8 @@ from megloc_kapture.stages.matches import (
     CACHED_IMAGES,
     Features,
     VerifiedMatches,
-    best_pairs,
     match_all,
+    pairs_to_rematch,
     verified,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
@@ -96,7 +96,7 @@ class LocalType:
 
     @cached_property
     def second_matcher(self) -> Matcher | None:
-        return self._options.make_second_matcher()
+        return self._options.make_second_matcher(of_queries=True)
 
     @cached_property
     def extractor(self) -> LocalFeatureExtractor:
@@ -159,8 +159,8 @@ class LocalType:
         options = self._options
         if self.second_matcher is not None:
             verified = {("", name): len(pair.matches) for name, pair in pairs.items()}
-            best = best_pairs(verified, options.second_matching.pairs, of_both=False)
-            names = [name for _, name in best]
+            chosen = pairs_to_rematch(verified, options.second_matching, of_both=False)
+            names = [name for _, name in chosen]
             again = self.match(query, names, self.second_matcher)
             pairs = {**pairs, **dict(zip(names, again, strict=True))}
         is_hard = options.guided_pyramid.is_hard
@@ -579,7 +579,7 @@ class LiveSource:
         self.clock.lap("retrieval")
         self._matches: list[list[VerifiedMatches]] = [[] for _ in matching.types]
         options = matching.options
-        self._needs_all = options.reranking.reranks() or options.matches_again()
+        self._needs_all = options.reranking.reranks() or options.rematches_queries()
         self.in_turn = ranked and not self._needs_all
         if self._needs_all:
             self._view = self._match(len(self._images))

@@ -57,12 +57,12 @@ from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
     Verification,
-    best_pairs,
     cached_features,
     mapping_pairs,
     match_all,
     match_pairs,
     one_way,
+    pairs_to_rematch,
 )
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -459,23 +459,25 @@ def _retry(
 
 
 class _AgainStage(PipelineStage):
-    """Match the best pairs again by a second matcher, then pairs with few matches by pyramids."""
+    """Match some pairs again by a second matcher, then pairs with few matches by pyramids."""
 
     version = 4
     matches: ClassVar[str]
+    of_queries: ClassVar[bool]
     explained_by = (
         "guided_pyramid.mode",
         "guided_pyramid.min_matches",
         "guided_pyramid.count",
         "second_matching.matcher",
         "second_matching.pairs",
+        "second_matching.min_matches",
     )
 
-    def is_wanted(self) -> bool:
-        return self.options.matches_again()
+    def second_matcher(self) -> Matcher | None:
+        return self.options.make_second_matcher(of_queries=self.of_queries)
 
     def plugins(self) -> Sequence[object]:
-        extractors, second = self.options.make_extractors(), self.options.make_second_matcher()
+        extractors, second = self.options.make_extractors(), self.second_matcher()
         matchers = [self.options.make_matcher(extractor.name) for extractor in extractors]
         return [*extractors, *matchers, *(() if second is None else (second,))]
 
@@ -488,18 +490,18 @@ class _AgainStage(PipelineStage):
         verification: Verification,
     ) -> dict[str, float]:
         options, out = self.options, work.out / self.writes[0]
-        second_matcher, within_one = options.make_second_matcher(), first.root == second.root
+        second_matcher, within_one = self.second_matcher(), first.root == second.root
         counts: dict[str, float] = {}
         for extractor in options.make_extractors():
             name = extractor.name
             rows = read_match_counts(work.path(self.matches), name)
             if second_matcher is not None:
-                best = best_pairs(
+                chosen = pairs_to_rematch(
                     {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
-                    options.second_matching.pairs,
+                    options.second_matching,
                     of_both=within_one,
                 )
-                again = [ImagePair(*pair, 1.0) for pair in best]
+                again = [ImagePair(*pair, 1.0) for pair in chosen]
                 matched = match_pairs(
                     first, second, again, name, second_matcher, verification, out, work=work
                 )
@@ -529,7 +531,7 @@ class PyramidMapping(_AgainStage):
     """Match pairs of map images again: by a second matcher, and at other scales and rotations."""
 
     name = "mapping_pyramid"
-    matches = MAPPING_MATCHES
+    matches, of_queries = MAPPING_MATCHES, False
     uses = (
         *MATCHING_OPTIONS,
         "mapping_verification",
@@ -541,7 +543,7 @@ class PyramidMapping(_AgainStage):
     outputs = (MAPPING_PYRAMID,)
 
     def is_wanted(self) -> bool:
-        return super().is_wanted() and self.options.triangulates()
+        return self.options.rematches_map() and self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping = work.folder(self.mapping(), FEATURES, MAPPING_MATCHES)
@@ -553,7 +555,7 @@ class PyramidQueries(_AgainStage):
     """Match queries with candidates again; see :class:`PyramidMapping`."""
 
     name = "query_pyramid"
-    matches = QUERY_MATCHES
+    matches, of_queries = QUERY_MATCHES, True
     uses = (
         *MATCHING_OPTIONS,
         "map",
@@ -571,6 +573,9 @@ class PyramidQueries(_AgainStage):
         QUERY_MATCHES,
     )
     outputs = (QUERY_PYRAMID,)
+
+    def is_wanted(self) -> bool:
+        return self.options.rematches_queries()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         query = work.folder(self.query(), FEATURES, QUERY_MATCHES)

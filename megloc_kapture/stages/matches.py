@@ -79,7 +79,7 @@ Verification = KnownPoseOptions | TwoViewOptions | None
 
 
 class SecondMatchingOptions(Options):
-    """Second pass of matching: the best pairs are matched again by another matcher."""
+    """Second pass of matching: some pairs of each image are matched again by another matcher."""
 
     matcher: PluginChoice | None = Field(
         default=None,
@@ -90,6 +90,15 @@ class SecondMatchingOptions(Options):
         gt=0,
         description="number of pairs per image that are matched again: those of a query, or of a "
         "map image, that have the most verified matches",
+    )
+    min_matches: int | None = Field(
+        default=None,
+        gt=0,
+        description="match only pairs again that have verified matches, but fewer than this; "
+        "none: all",
+    )
+    queries: bool = Field(
+        default=True, description="also match queries again; false: only map images"
     )
 
 
@@ -180,20 +189,24 @@ def match_pairs(
     }
 
 
-def best_pairs(
-    verified: Mapping[tuple[str, str], int], number: int, *, of_both: bool
+def pairs_to_rematch(
+    verified: Mapping[tuple[str, str], int], options: SecondMatchingOptions, *, of_both: bool
 ) -> list[tuple[str, str]]:
-    """Return the ``number`` pairs with the most verified matches of each first image.
+    """Return the pairs of the second matching, from the number of verified matches of all pairs.
 
+    These are the ``pairs`` best of each first image; with ``min_matches``, the best of those with
+    fewer matches, but not without any: these are seldom pairs of overlapping images.
     With ``of_both``, also those of each second image; a pair then counts for both of its images.
     Ties are broken by name, and the result is sorted by name.
     """
+    limit = options.min_matches
+    eligible = [pair for pair, n in verified.items() if limit is None or 0 < n < limit]
     chosen: set[tuple[str, str]] = set()
     taken: Counter[str] = Counter()
-    for pair in sorted(verified, key=lambda pair: (-verified[pair], pair)):
+    for pair in sorted(eligible, key=lambda pair: (-verified[pair], pair)):
         for image in pair if of_both else pair[:1]:
             taken[image] += 1
-            if taken[image] <= number:
+            if taken[image] <= options.pairs:
                 chosen.add(pair)
     return sorted(chosen)
 

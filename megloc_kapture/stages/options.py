@@ -118,9 +118,14 @@ class PipelineOptions(Options):
         """Return whether guided pyramid matching is enabled."""
         return self.guided_pyramid.mode != "off"
 
-    def matches_again(self) -> bool:
-        """Return whether some pairs are matched again, by a second matcher or guided pyramids."""
+    def rematches_map(self) -> bool:
+        """Return whether map pairs are matched again, by a second matcher or guided pyramids."""
         return self.uses_pyramid() or self.second_matching.matcher is not None
+
+    def rematches_queries(self) -> bool:
+        """Return whether pairs of queries are matched again."""
+        second = self.second_matching
+        return self.uses_pyramid() or (second.matcher is not None and second.queries)
 
     def triangulates(self) -> bool:
         return self.map == "triangulate"
@@ -163,10 +168,13 @@ class PipelineOptions(Options):
         matcher: Matcher = load_chosen(MATCHERS, self.matching_of(local_type), self.placement)
         return matcher
 
-    def make_second_matcher(self) -> Matcher | None:
-        """Create the matcher of the second pass, or None."""
+    def make_second_matcher(self, *, of_queries: bool) -> Matcher | None:
+        """Create the matcher of the second pass of queries, or of map images; or None."""
         chosen = self.second_matching.matcher
-        return None if chosen is None else load_chosen(MATCHERS, chosen, self.placement)
+        if chosen is None or (of_queries and not self.second_matching.queries):
+            return None
+        matcher: Matcher = load_chosen(MATCHERS, chosen, self.placement)
+        return matcher
 
     def verify_mapping(self) -> Verification:
         return None if self.verification == "none" else self.mapping_verification

@@ -252,11 +252,11 @@ class PipelineStage(Stage):
         if not self.options.triangulates():
             return ()
         # a pair is read from the first folder that contains it
-        again = self.options.matches_again()
+        again = self.options.rematches_map()
         return (MAPPING_PYRAMID, MAPPING_MATCHES) if again else (MAPPING_MATCHES,)
 
     def query_matches(self) -> tuple[str, ...]:
-        again = self.options.matches_again()
+        again = self.options.rematches_queries()
         return (QUERY_PYRAMID, QUERY_MATCHES) if again else (QUERY_MATCHES,)
 
     def sparse_map(self) -> str:

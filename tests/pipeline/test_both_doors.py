@@ -26,7 +26,7 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.stages.matches import best_pairs, candidates_of
+from megloc_kapture.stages.matches import SecondMatchingOptions, candidates_of, pairs_to_rematch
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.stage import MAPPING_MATCHES, QUERY_MATCHES
 from megloc_kapture.values import RigidTransform
@@ -143,7 +143,7 @@ def check_second_matches(workspace: Workspace) -> None:
         first = read_match_counts(workspace.path(part), TYPE)
         second = read_match_counts(again, TYPE)
         counts = {pair: row.verified for pair, row in first.items()}
-        best = best_pairs(counts, 2, of_both=kind == "mapping")
+        best = pairs_to_rematch(counts, SecondMatchingOptions(pairs=2), of_both=kind == "mapping")
         assert set(second) == set(best) and len(best) < len(first)
         # the ratio test removes matches
         assert all(row.matches < first[pair].matches for pair, row in second.items())

@@ -37,12 +37,13 @@ from megloc_kapture.stages.image_pairs import (
     vectors_of,
 )
 from megloc_kapture.stages.matches import (
+    SecondMatchingOptions,
     VerifiedMatches,
-    best_pairs,
     candidates_of,
     check_given_poses,
     match_all,
     match_pairs,
+    pairs_to_rematch,
 )
 from megloc_kapture.stages.reranking import RerankingOptions, counted, rerank, reranked
 from megloc_kapture.values import ImageFeatures
@@ -397,11 +398,15 @@ def test_pairs_without_matches_are_stored_and_repeated_pairs_matched_once(
         assert {pair: reader.length(*pair) for pair in reader.pairs} == {empty: 0, full: matched}
 
 
-def test_the_best_pairs_are_those_with_most_verified_matches() -> None:
+def test_the_pairs_to_rematch_are_those_with_most_verified_matches() -> None:
     verified = {("a", "b"): 5, ("a", "c"): 9, ("a", "d"): 5, ("b", "c"): 1, ("c", "d"): 0}
     of_first = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d")]
-    assert best_pairs(verified, 2, of_both=False) == of_first
-    assert best_pairs(verified, 1, of_both=True) == [("a", "b"), ("a", "c"), ("a", "d")]
+    two, lone = (SecondMatchingOptions(pairs=pairs) for pairs in (2, 1))
+    assert pairs_to_rematch(verified, two, of_both=False) == of_first
+    assert pairs_to_rematch(verified, lone, of_both=True) == [("a", "b"), ("a", "c"), ("a", "d")]
+    # the weak pairs alone, but not a pair without matches
+    weak = SecondMatchingOptions(pairs=1, min_matches=9)
+    assert pairs_to_rematch(verified, weak, of_both=True) == [("a", "b"), ("a", "d"), ("b", "c")]
 
 
 @pytest.mark.parametrize(
