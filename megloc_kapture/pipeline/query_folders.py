@@ -335,8 +335,9 @@ class Photographs(Queries):
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be used; give 1 or more")
         check_option(paths, "no photographs are given; name image files or folders")
-        if not isinstance(camera, Mapping | None):
-            check_camera(camera)
+        for each in camera.values() if isinstance(camera, Mapping) else (camera,):
+            if each is not None:
+                check_camera(each)
         check_option(
             all(isinstance(path, str | Path) for path in paths),
             "photographs are given as files or folders; localize arrays one at a time",
