@@ -1,4 +1,4 @@
-"""Plain value types of all layers: cameras, rigid transforms, features."""
+"""Plain value types that all layers share: cameras, rigid transforms, features."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from megloc_kapture.errors import DataError
 
-# COLMAP camera models by number of parameters (formats: colmap doc/cameras.rst)
+# numbers of parameters of COLMAP's camera models (formats: colmap doc/cameras.rst)
 CAMERA_MODEL_NUM_PARAMS: dict[str, int] = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -114,7 +114,8 @@ class Camera:
             object.__setattr__(self, "height", int(self.height))
             object.__setattr__(self, "params", tuple(float(p) for p in self.params))
         except (TypeError, ValueError) as error:  # for example a matrix K
-            raise DataError(f"camera model {self.model}: sizes and params are numbers") from error
+            message = f"camera model {self.model}: sizes and params must be numbers"
+            raise DataError(message) from error
         if len(self.params) != expected:
             raise DataError(
                 f"camera model {self.model} takes {expected} parameters, got {len(self.params)}"
@@ -127,7 +128,7 @@ class Camera:
         if min(focals) <= 0:
             raise DataError(f"focal length {min(focals)} is not positive")
         if not (math.isfinite(self.focal_deviation) and self.focal_deviation >= 0):
-            raise DataError(f"focal_deviation {self.focal_deviation} is not 0 or positive")
+            raise DataError(f"focal_deviation {self.focal_deviation} is negative or not finite")
 
     @classmethod
     def pinhole(cls, width: int, height: int, focal: float) -> Camera:
@@ -141,10 +142,10 @@ class Camera:
 
 
 def check_camera(camera: Any) -> None:
-    """Raise DataError for other descriptions of a camera, such as a matrix K."""
+    """Raise DataError for anything but a :class:`Camera`, such as a matrix K."""
     if not isinstance(camera, Camera):
         raise DataError(
-            "a camera is a megloc_kapture.Camera (Camera.from_colmap converts pycolmap's), "
+            "a camera must be a megloc_kapture.Camera (Camera.from_colmap converts pycolmap's), "
             f"got {type(camera)}"
         )
 
@@ -172,8 +173,8 @@ class RigidTransform:
     ) -> RigidTransform:
         """Create a transform from a rotation matrix (3, 3) and a translation (3,)."""
         (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
-        # the quaternion is the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix,
-        # which is numerically stable for every rotation
+        # the quaternion is the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix;
+        # this is numerically stable for every rotation
         k = np.array(
             [
                 [a + e + i, 0.0, 0.0, 0.0],
@@ -267,8 +268,8 @@ class ImageFeatures:
 
     Parameters
     ----------
-    keypoints_px : float32 (N, 2 or more); x, y first, then further stored columns, for SuperPoint
-        and similar features the score. The first pixel's centre is (0.5, 0.5).
+    keypoints_px : float32 (N, 2 or more); x, y first, then other stored columns, such as the score
+        of SuperPoint. The first pixel's centre is (0.5, 0.5).
     descriptors : (N, D).
     width, height : size of the image in pixels.
     """
@@ -334,7 +335,7 @@ class LocalizationResult:
     cluster : index of the result's cluster in ``clusters``.
     score : ranking score of a cluster's pose, higher is better.
     refinements : results of the pose refiners, in their order.
-    remarks : skipped steps, with the data that query or map lack, and doubts about the focal
+    remarks : skipped steps, with the data that the query or map lacks, and doubts about the focal
         length.
     fallback : source of the pose that a failed query gets: ``retrieval`` for the pose of its best
         candidate, ``rig`` for the pose of another camera of its rig, moved by the rig's geometry.

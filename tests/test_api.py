@@ -241,7 +241,7 @@ def test_other_descriptions_of_a_camera_are_refused(
         lambda: built.localizer().localize(image, camera),
         lambda: megloc.solve_pose(points[:, :2], points, camera),
     ):
-        with pytest.raises(megloc.DataError, match="a camera is a megloc_kapture.Camera"):
+        with pytest.raises(megloc.DataError, match="a camera must be a megloc_kapture.Camera"):
             refused()
 
 

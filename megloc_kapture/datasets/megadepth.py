@@ -4,7 +4,7 @@ The layout is that of the published archives and of D2-Net's ``megadepth_utils``
 
     phoenix/S6/zl548/MegaDepth_v1/SCENE/dense0/depths/NAME.h5    depth of the undistorted images
     depth_undistorted/SCENE/NAME.h5                              the same, as in glue-factory
-    Undistorted_SfM/SCENE/{images,sparse or sparse-txt}          COLMAP's image_undistorter
+    Undistorted_SfM/SCENE/{images,sparse or sparse-txt}          by COLMAP's image_undistorter
     scene_info/SCENE.npz                                         paths, intrinsics, poses
 
 Cameras and poses come from the undistorted model, else from ``scene_info``. Pickled object arrays
@@ -57,7 +57,7 @@ _Image = tuple[Path, Path, Camera, RigidTransform]
 def import_megadepth(
     root: Path, output: Path, scenes: Sequence[str] = (), *, work: Work = HERE
 ) -> dict[str, int]:
-    """Write scenes (default: all) as ``output/SCENE``; skip images without metric depth."""
+    """Write scenes (default: all) as ``output/SCENE``; skip images with ordinal or no depth."""
     scenes = list(map(check_component, scenes)) or _scenes(root)
     require(scenes, f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
     counts = {"scenes": 0, "images": 0, "without_depth": 0}
@@ -72,7 +72,7 @@ def import_megadepth(
 
 
 def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
-    """Read a depth map (H, W), 0 where unknown; return None if there is only ordinal depth."""
+    """Read a depth map (H, W), 0 where unknown; return None if it is ordinal or all unknown."""
     import h5py
 
     with reading(path, "an HDF5 file with 'depth'"), h5py.File(path, "r") as file:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from megloc_kapture.evaluation.comparison import Comparison
 
-_CHI2_95 = 12.592  # quantile of six degrees of freedom
+_CHI2_95 = 12.592  # 95 % quantile for six degrees of freedom
 
 NO_POSE = "no pose in the result"
 Outcome = Literal["localized", "fallback", "missing"]
@@ -134,7 +134,8 @@ class Evaluation(Reported):
     not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
     truth_known_by : note on true poses that are not published; else empty.
     pairs : name of a query -> its pair, for the MLAD challenges.
-    nowhere : queries that show nothing of the map; recall ignores them, and their poses are wrong.
+    nowhere : queries that show nothing of the map; recall ignores them, and any pose of theirs is
+        wrong.
     by_center : the same pairs of MLAD, evaluated by the error of the camera centre.
     covariance : counts of localized poses: ``num_poses`` have a covariance, ``num_within`` have the
         true pose in its 95 % region.
@@ -303,7 +304,7 @@ def query_result(
     errors: tuple[float, float],
     truth: RigidTransform | None = None,
 ) -> QueryResult:
-    """Return the outcome of a query with errors in metres and degrees."""
+    """Return the result of a query, given its errors in metres and degrees."""
     pose = result.poses.get(image)
     status = result.statuses.get(image)
     if status is None:
@@ -340,7 +341,7 @@ def evaluate_pairs(
     *,
     thresholds: Sequence[Threshold] | None = None,
 ) -> Evaluation:
-    """Evaluate by MLAD's metric: every pair counts once; with several files, each is a condition.
+    """Evaluate by MLAD's metric: every pair counts once; each of several files is a condition.
 
     A pair has the name of its query; a query in several pairs is named "QUERY from REFERENCE,
     FILE". Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the

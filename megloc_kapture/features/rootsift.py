@@ -1,6 +1,6 @@
 """SIFT with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012, section 3).
 
-``rootsift`` uses OpenCV's SIFT, which is 2 to 5 times faster than pycolmap's and as accurate
+``rootsift`` uses OpenCV's SIFT, which is four times as fast as pycolmap's
 (docs/experiments/features.md). ``sift`` is COLMAP's SIFT: VLFeat's implementation of Lowe's
 detector (IJCV 2004) with byte descriptors, as in the databases of published COLMAP models.
 """
@@ -95,8 +95,8 @@ class ColmapSiftOptions(BoundedOptions):
     max_keypoints: int = Field(
         default=8192,
         gt=0,
-        description="number of coarsest keypoints kept; COLMAP keeps whole scale levels, so that "
-        "there may be more without a mask",
+        description="number of coarsest keypoints kept; without a mask there may be more, because "
+        "COLMAP keeps whole scale levels",
     )
     first_octave: int = Field(
         default=-1, ge=-1, le=5, description="first octave; -1 doubles the image size, 0 keeps it"

@@ -14,12 +14,12 @@ from numba import get_num_threads
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.projection import PINHOLES, distorted
 
-# a point is undetermined if a pivot of its information matrix is a smaller share of the trace
+# a point is undetermined if a pivot of its information matrix is at most this share of the trace
 _MIN_RATIO = 1e-13
 
 
 def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(first, last)`` for independent parts of ``range(count)``, in threads."""
+    """Call ``work(first, last)`` for chunks ``first:last`` of ``range(count)``, in threads."""
     starts = range(0, count, size)
     with ThreadPoolExecutor(get_num_threads()) as executor:  # one per available core
         for _ in executor.map(work, starts, [min(first + size, count) for first in starts]):
@@ -30,11 +30,11 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
 def most_shared(
     first, last, starts, of_image, images, track, track_starts, window, min_shared, best
 ):
-    """Fill rows ``first`` to ``last`` of ``best`` (I, K) with images that share the most points.
+    """Fill ``best[first:last]`` with the images that share the most points with each image.
 
-    Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations are sorted by
-    track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``. At most
-    ``window`` observations of the track before and after an observation are visited.
+    ``best`` is (I, K). Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations
+    are sorted by track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``.
+    At most ``window`` observations of the track before and after an observation are visited.
     """
     shared = np.zeros(len(best), np.int64)
     touched = np.empty(len(best), np.int64)
@@ -84,7 +84,7 @@ def covariances_of_points(
             inverse = 1.0 / z
             u, v = x * inverse, y * inverse
             au, av, bu, bv = 1.0, 0.0, 0.0, 1.0
-            if models[k] > PINHOLES:  # twice as fast for pinholes
+            if models[k] > PINHOLES:  # skipping it for pinholes halves the time
                 _, _, au, av, bu, bv = distorted(models[k], params[k], u, v)
             fx, fy = params[k, 0] * inverse, params[k, 1] * inverse
             # z times the derivatives of u and v with respect to the point in the world

@@ -1,6 +1,7 @@
-"""Compiled loops of stereo: correlation under planes, semi-global paths, view consistency.
+"""Compiled loops of stereo: plane-sweep costs, semi-global paths, consistency between views.
 
-Import only when needed: numba takes half a second. Images are float32 (H, W), NaN where invalid.
+Import only when needed: numba takes half a second. Brightness images are float32 (H, W), NaN where
+invalid; inverse depth is float32 (H, W), 0 where unknown.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -19,7 +20,7 @@ _FLAT = np.float32(1e-6)
 
 @compiled_loop
 def window_sums(image, other, radius, row, columns, sums):
-    """Fill ``sums`` (3, W) with those of image, image^2 and image * other over a row's windows."""
+    """Sum image, image^2 and image * other over the windows of a row, into ``sums`` (3, W)."""
     height, width = image.shape
     for x in range(width):
         columns[0, x] = columns[1, x] = columns[2, x] = np.float32(0)
@@ -45,10 +46,10 @@ def window_sums(image, other, radius, row, columns, sums):
 
 @compiled_loop
 def correlate(reference, warped, radius, costs):
-    """Compute the matching cost under one plane: 1 - the mean of the two best correlations.
+    """Compute the matching cost for one plane, from the mean ZNCC of the two best sources.
 
     ``warped`` float32 (S, H, W) are the sources warped by the plane. ``costs`` uint8 (H, W) is
-    filled with 255 (1 - ZNCC), limited to 255. Pixels that no source sees also have the cost 255.
+    filled with 255 (1 - mean), limited to 255. Pixels that no source sees also have the cost 255.
     """
     height, width = reference.shape
     num_sources = len(warped)
@@ -86,7 +87,7 @@ def add_path(cost, grey, p1, p2, edge, dy, dx, total):
 
     Equation 13 of Hirschmueller, PAMI 2008, is
     ``L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + p1, min_k L(q, k) + p2') - min_k L(q, k)``
-    with q the pixel before p by (dy, dx), and ``p2' = max(p1, p2 edge / (edge + |I(p) - I(q)|))``.
+    with q = p - (dy, dx), and ``p2' = max(p1, floor(p2 edge / (edge + |I(p) - I(q)|)))``.
     """
     height, width, depth = cost.shape
     before = np.full((width, depth + 2), _FAR, np.float32)
@@ -127,7 +128,7 @@ def add_path(cost, grey, p1, p2, edge, dy, dx, total):
 
 @compiled_loop
 def best_labels(total, labels):
-    """Fill ``labels`` (H, W) with the fractional labels of the smallest totals, by a parabola."""
+    """Fill ``labels`` (H, W) with those of the smallest totals, refined by fitting a parabola."""
     height, width, depth = total.shape
     for y in range(height):
         for x in range(width):
@@ -149,7 +150,7 @@ def best_labels(total, labels):
 def count_agreeing(
     inverse, other, infinity, baseline, back_infinity, back_baseline, max_px, max_share, counts
 ):
-    """Increment ``counts`` where another view's inverse depth (H, W) agrees in both directions.
+    """Increment ``counts`` (H, W) where ``inverse`` agrees with another view after a round trip.
 
     ``infinity`` and ``baseline`` project into the other view, ``back_infinity`` and
     ``back_baseline`` back into this view. ``max_px`` limits the round-trip error, ``max_share`` the
@@ -189,7 +190,7 @@ def count_agreeing(
                 continue
             back_x = (g[0, 0] * u + g[0, 1] * v + g[0, 2] + c[0] * other_inverse) / qz
             back_y = (g[1, 0] * u + g[1, 1] * v + g[1, 2] + c[1] * other_inverse) / qz
-            # q is K (R p z' + t) / z', with z' the depth in the other view
+            # q is K X / z', with X the point in this view and z' its depth in the other view
             depth = qz / other_inverse
             if (back_x - x) ** 2 + (back_y - y) ** 2 > max_px * max_px:
                 continue

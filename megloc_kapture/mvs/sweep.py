@@ -5,6 +5,7 @@ are scored by the two best normalised cross-correlations and regularised by semi
 (Hirschmueller, PAMI 2008) at half size; depth is then refined by PatchMatch with slanted planes
 (Bleyer et al., BMVC 2011) at full size. A homogeneous pixel ``p`` of inverse depth ``w`` projects
 to ``infinity p + w baseline`` in a source, with ``infinity = K_s R K^-1`` and ``baseline = K_s t``.
+Planes (H, W, 3) are the inverse depth at each pixel and its slopes along x and y.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _TONE = 20.0  # difference from the centre's brightness (0 to 255) that has the 
 # penalties for a step of one label and of more labels, and the contrast that halves the latter
 _P1, _P2, _EDGE = 8.0, 40.0, 20.0
 _DIRECTIONS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
-# matching error in pixels, and factor on the least-squares bound (docs/experiments/mvs.md)
+# matching error in pixels, and factor for the least-squares deviation (docs/experiments/mvs.md)
 CALIBRATION = np.array([0.15, 2.0])
 _MAX_COST = 0.7  # largest accepted 1 - ZNCC
 
@@ -82,7 +83,7 @@ class Sweep:
 
 
 class ColmapStereo:
-    """Plugin ``colmap``: COLMAP's PatchMatch (Schoenberger et al., ECCV 2016), needs CUDA."""
+    """Plugin ``colmap``: COLMAP's PatchMatch (Schoenberger et al., ECCV 2016); needs CUDA."""
 
     name = "colmap"
 
@@ -221,7 +222,7 @@ def cost_volume(
 
 
 def semi_global(volume: NDArray[np.uint8], grey: Image) -> Floats:
-    """Find the fractional labels float64 (H, W) with the smallest path costs in 8 directions."""
+    """Find fractional labels (H, W) with the smallest path costs, summed over 8 directions."""
     from megloc_kapture.mvs.kernels import add_path, best_labels
 
     total = np.zeros(volume.shape, np.uint16)

@@ -20,7 +20,7 @@ RESNET_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}
 RESNET_WIDTHS, RESNET_EXPANSION = (64, 128, 256, 512), 4
 # ImageNet's statistics, RGB in [0, 1]
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# activations are clamped to this so that powers and gradients stay finite
+# lower bound of activations, so that powers and gradients stay finite
 _MINIMUM = 1e-6
 
 
@@ -34,7 +34,7 @@ def vgg16_features(*, last: int) -> nn.Sequential:
     channels = 3
     for widths in _VGG_STAGES:
         for width in widths:
-            # in place: feature maps of a large image take 200 MB
+            # in place: one feature map of a large image takes 200 MB
             layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
             channels = width
         layers.append(nn.MaxPool2d(2))
@@ -126,7 +126,8 @@ class ResNet(nn.Module):
 def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> torch.Tensor:
     """Compute the generalized mean (B, C) of features (B, C, H, W), clamped to at least 1e-6.
 
-    Power 1 is the mean, infinity the maximum; 0 is invalid. The result is float32 or float64.
+    Power 1 gives the mean, large powers approach the maximum; 0 is invalid. The result is float32
+    or float64.
     """
     # the third power of 41 overflows in half precision
     values = features if features.dtype == torch.float64 else features.float()

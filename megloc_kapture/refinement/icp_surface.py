@@ -25,7 +25,7 @@ NORMAL_NEIGHBOURS = 20  # small_gicp's default
 _MAX_ITERATIONS = 20
 _ROTATION_EPSILON_RAD = 1e-4
 _TRANSLATION_EPSILON_M = 1e-4
-_CONVERGED = 5e-5  # norm of the last step (radians, metres), a hundredth of the required accuracy
+_CONVERGED = 5e-5  # a step with a smaller norm (radians, metres) is the last
 # Cauchy scale with 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
 
@@ -139,7 +139,7 @@ def fit_to_surface(
 ) -> RigidTransform | None:
     """Fit points (N, 3) to a surface: point-to-plane ICP by Levenberg-Marquardt (``PLANE_ICP``).
 
-    Return None without correspondences within ``max_distance_m``.
+    Return None without correspondences within ``max_distance_m``, or if the fit is not finite.
     """
     cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
     result = small_gicp.align(
@@ -158,14 +158,15 @@ def fit_to_surface(
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    overlap: float  # share of the points within the near distance from the surface
+    overlap: float  # share of the points within the near distance of the surface
     reach: float  # share of the points within the far distance
-    # median distance from the surface's planes, of points within the far distance; infinite if none
+    # median point-to-plane distance of the points within the far distance; infinite if none
     residual_m: float
-    # points, normals: float64 (K, 3) in the points' frame, of points within the near distance
+    # points within the near distance and the surface's normals there, both float64 (K, 3) in the
+    # points' frame
     points: Floats
     normals: Floats
-    residuals_m: Floats  # float64 (K,), signed distances from the planes
+    residuals_m: Floats  # float64 (K,), signed point-to-plane distances
 
 
 def surface_fit(
@@ -224,7 +225,7 @@ def fit_weighted(
     surface_from_points: RigidTransform,
     max_distance_m: float,
 ) -> RigidTransform | None:
-    """Refine a point-to-plane fit of points (N, 3) to a nearby surface, weighted by noise (N,).
+    """Refine a point-to-plane fit of points (N, 3) with noise deviations (N,) to a nearby surface.
 
     It minimises a Cauchy loss by Gauss-Newton. Returns None with fewer than six points within
     ``max_distance_m``, or if the transform is undetermined.
@@ -243,7 +244,7 @@ def fit_weighted(
         if scale == 0:
             return transform
         weights = 1.0 / (1.0 + (relative / (_CAUCHY_EFFICIENT * scale)) ** 2) / noise[near] ** 2
-        # rotations are about the camera centre, which is the origin of the points
+        # rotations are about the camera centre, which is the origin of the points' frame
         origin = np.array(transform.translation)
         jacobian = np.column_stack([np.cross(transformed - origin, normals), normals])
         weighted = jacobian * weights[:, None]

@@ -62,7 +62,7 @@ def counts_text(counts: Mapping[str, float]) -> str:
     return ", ".join(texts)
 
 
-# imported kapture folders
+# paths in the workspace; the first four are imported kapture folders
 MAPPING, QUERY, QUERY_GT, REFERENCE = "mapping", "query", "query_gt", "reference"
 PREPROCESSED = "preprocessed"
 POSED, PHOTOGRAPH_MATCHES = "posed", "matches/photographs"  # for photographs without poses
@@ -127,7 +127,7 @@ class Stage(ABC):
     resumes : the output of an interrupted run is kept, and the items in it are skipped.
     reads, writes : paths in the workspace; a folder includes its contents.
     root : folder of user data that the stage imports, or None; a workspace has one root.
-    placement : device and precision of the stage's networks; ``run`` gets them with its context.
+    placement : device and precision of the stage's networks; ``run`` gets it in ``work``.
     """
 
     root: Path | None = None
@@ -181,7 +181,8 @@ class PipelineStage(Stage):
 
     Attributes
     ----------
-    uses : option keys that determine the output; ``local_features.name`` means all their names.
+    uses : option keys that determine the output; ``local_features.name`` means the names of all
+        local features.
     explained_by : option keys that best explain whether and how the stage runs.
     inputs, outputs : workspace paths, or methods of this class that return them.
     posed : the poses of the map images are estimated by an earlier stage.
