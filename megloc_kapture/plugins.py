@@ -65,10 +65,10 @@ class LocalFeatureExtractor(Protocol):
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Extract from an RGB image, uint8 (H, W, 3), only on True pixels of the mask (H, W).
+        """Extract from an RGB image, uint8 (H, W, 3), only at True pixels of the mask (H, W).
 
-        Raise DataError to reject an image, for example if it is too small; guided pyramid matching
-        then skips that scale.
+        Raise DataError, without a path, to reject an image, for example if it is too small; guided
+        pyramid matching then skips that scale or rotation.
         """
         ...
 
@@ -146,7 +146,7 @@ class HypothesisView:
 
 @dataclass(frozen=True, eq=False)
 class PoseHypothesis:
-    """The pose of one cluster of map images.
+    """A query's pose, estimated from one cluster of map images.
 
     Attributes
     ----------
@@ -280,7 +280,7 @@ class PoseRanker(Protocol):
     def score(
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
-        """Return one score (H,) per hypothesis, higher is better; the first wins a tie."""
+        """Return one score per hypothesis, (H,); higher is better, and the first wins a tie."""
         ...
 
 
@@ -327,7 +327,7 @@ class PoseRefiner(Protocol):
 class DatasetAdapter(Protocol):
     """Group ``megloc_kapture.datasets``: a dataset's official layout to kapture folders.
 
-    ``card`` is a ``megloc_kapture.datasets.official.DatasetCard``, ``read`` returns an
+    ``card`` is a ``megloc_kapture.datasets.official.DatasetCard``; ``read`` returns an
     ``OfficialDataset`` of the same module. ``root`` is read-only.
     """
 
@@ -341,7 +341,7 @@ class DatasetAdapter(Protocol):
         ...
 
     def read(self, root: Path, *, allow_missing: bool = False) -> Any:
-        """Read the dataset; DataError names file and line."""
+        """Read the dataset; DataError names the file and line."""
         ...
 
 
@@ -364,8 +364,8 @@ class RenderedDataset(Protocol):
     def write(self, root: Path, work: Any) -> Mapping[str, float]:
         """Render the dataset below ``root``, with a ``megloc_kapture.stages.work.Work``.
 
-        Return counts for the log. The bytes depend on the options alone. OutputError if the files
-        cannot be written.
+        Return counts for the log. The bytes depend on the options alone. Raise OutputError if the
+        files cannot be written.
         """
         ...
 

@@ -58,15 +58,15 @@ class Eval(Deciding, Working):
     query_prefix: str = ""
     """Put the queries into a folder of this name, if they share names with map images."""
     from_stage: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """Run this stage and all later ones again; use the results of earlier stages as they are."""
+    """Run this stage and its dependents again; use the results of earlier stages as they are."""
     until: str | None = None
     """Stop after this stage."""
     dry_run: bool = False
     """List the stages that would run, and why."""
     explain: bool = False
-    """List all stages, on or off, with the options that decide; run nothing."""
+    """List all stages, on or off, with the options that decide this; run nothing."""
     fail_below: float | None = None
-    """Exit with 3 if the recall (0 to 1) at the last threshold is lower."""
+    """Exit with status 3 if the recall (0 to 1) at the last threshold is lower."""
     force: Overwrite = False
     """Use a non-empty workspace, or that of another root; accept map poses that contradict the
     matches of their images."""

@@ -81,7 +81,7 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ExtractLocal(Choosing, Working):
-    """Extract local features of all images of kapture folders."""
+    """Extract local features from all images of kapture folders."""
 
     allow_links_below: AllowedLinks = ()
     input: Inputs = ()
@@ -300,7 +300,7 @@ class PairsQuery(Reading, Choosing, Working):
     matches_dir: Path | None = None
     """Folder for the matches computed for reranking; later steps use them."""
     force: Overwrite = False
-    """Overwrite the pairs file and the folder of matches."""
+    """Overwrite the pairs file, and write into a non-empty folder of matches."""
 
     def run(self) -> None:
         if (self.rerank is None) != (self.matches_dir is None):
@@ -409,7 +409,7 @@ class Preprocess(Computing, Working):
     output: Output
     """Kapture folder of the new images."""
     resize: int | None = None
-    """Reduce images to this larger side, px; both sides are then cropped to multiples of 8."""
+    """Reduce images to a larger side of so many px, then crop both sides to multiples of 8."""
     undistort: bool = False
     """Remove lens distortion."""
     segmenter: str | None = None

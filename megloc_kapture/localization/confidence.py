@@ -25,7 +25,7 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
 _SAMPLE = 3  # matches that determine a pose
-_CELL = 0.01  # cell size as a share of the image's diagonal; a cell's inliers count once
+_CELL = 0.01  # cell size as a share of the image's diagonal; a cell's matches count once
 # a handful of wrong map points can agree with each other, so poses that see fewer are doubtful
 _MIN_VISIBLE = 50
 _MAX_PROJECTED = 2048  # number of points that estimate the visible share
@@ -63,7 +63,7 @@ class MatchSources:
     centers, images : float64 (sum of support, 3) and int64, the map images' centres and indices,
         grouped by match.
     num_keypoints : number of the query's keypoints, over all views and types.
-    noise : float64 (N, 2), the map's median reprojection error as angle and in pixels; NaN if
+    noise : float64 (N, 2), the map's median reprojection error as an angle and in pixels; NaN if
         unknown.
     seen : per view the points (K, 3) observed by the cluster's map images.
     displacements_rad : function of a pose that returns the angles between the inliers' projected
@@ -83,7 +83,7 @@ class MatchSources:
 def evidence_of(
     problem: PoseProblem, pose: Pose, sources: MatchSources, max_error_px: float
 ) -> dict[str, float]:
-    """Return the terms of :data:`TERMS` for a refined pose with inliers and covariance."""
+    """Return :data:`TERMS` and, if below 1, :data:`MAP_POINTS` for a pose with covariance."""
     assert pose.inliers is not None and pose.covariance is not None
     rig_from_world = pose.cam_from_world
     inliers = pose.inliers
@@ -125,8 +125,8 @@ def with_confidence(
     """Return the pose with its confidence and evidence, or a Failure if the confidence is too low.
 
     A wrong focal length shifts the camera (``misfit``, see :func:`~.focal_length.focal_misfit`).
-    The confidence is divided by the square of this shift relative to 3 % of the distance to the
-    points, if it is larger.
+    If this shift exceeds 3 % of the distance to the points, the confidence is divided by the square
+    of their ratio.
     """
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
@@ -286,7 +286,7 @@ OF_ALL = "all"
 
 @lru_cache(maxsize=1)
 def calibrations() -> Mapping[str, Calibration]:
-    """Return the calibrations by the beginning of the keypoints type; :data:`OF_ALL` for others."""
+    """Return the calibrations by prefix of the keypoints type; :data:`OF_ALL` for others."""
     text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
     return {
         name: Calibration(table["origin"], table["bias"], table["weights"])

@@ -57,7 +57,7 @@ from megloc_kapture.values import Camera, LocalFeatures, RigidTransform, check_c
 _log = logging.getLogger(__name__)
 
 FRAMES_EVERY = 30
-# features of at most so many queries are compared with the image size, and from so many keypoints
+# how many queries' keypoints are compared with the image size, and how many each must have
 _QUERIES_COMPARED, _MIN_COMPARED = 10, 100
 _LIST_SUFFIXES = (".txt", ".csv")
 
@@ -88,7 +88,7 @@ class Queries(ABC):
     def units(self, *, rigs: bool) -> list[scene.Unit]:
         """Return (name, ``cam_from_rig``) of the images that are localized jointly, by unit.
 
-        A unit has the images of a rig with one timestamp, or a single image.
+        A unit has the images of a rig at one timestamp, or a single image.
         """
         units = scene.query_units(self.data(), rigs=rigs)
         usable = (tuple(pair for pair in unit if pair[0] not in self.unreadable) for unit in units)
@@ -104,7 +104,7 @@ class Queries(ABC):
 
     @abstractmethod
     def data(self) -> KaptureData:
-        """Return sensors, rigs and records with the original cameras."""
+        """Return sensors, rigs and records; cameras have the input's pixel origin."""
 
     @abstractmethod
     def write_images(self, output: Path) -> None:
@@ -219,10 +219,10 @@ class KaptureQueries(Queries):
             )
 
     def _warn_of_other_size(self, local: MapKeypoints) -> None:
-        """Warn if the keypoints of all images span another size than the images."""
+        """Warn if keypoints span a size other than that of the images; only a few are read."""
         reach = []
         for name in [name for name in self.names if name in local][:_QUERIES_COMPARED]:
-            with suppress(DataError):  # a broken file fails alone, with its query
+            with suppress(DataError):  # a broken file fails only its own query
                 pixels = local.keypoints_px(name)[:, :2]
                 size = np.array(self._sensor(name).params[1:3], np.float64)
                 if len(pixels) >= _MIN_COMPARED and size.all():
@@ -230,7 +230,7 @@ class KaptureQueries(Queries):
         if reach and not 0.7 < max(reach) < 1.1:
             message = (
                 "%s: keypoints of type %r reach to %.0f %% of the size of the query images; scale "
-                "them if they were extracted at another image size, or the poses are wrong"
+                "them if they were extracted at another image size, or the poses will be wrong"
             )
             _log.warning(message, self._folder.root, local.name, 100 * max(reach))
 
@@ -306,13 +306,13 @@ class _Image:
 
 
 class Photographs(Queries):
-    """Photographs and videos, as queries or as input of a map.
+    """Photographs and videos, as queries or as input for a map.
 
     Without a given camera, images are turned upright by their EXIF orientation, and the camera
     describes the upright image. Its focal length comes from EXIF or a guess, and is always
-    estimated with the pose. A given camera describes the stored pixels, and is scaled uniformly to
-    images of another size. Photographs of the same make, model, size and focal length share a
-    camera, as do the frames of a video.
+    estimated with the pose. A given camera describes the stored pixels, and is scaled to images of
+    another size but the same aspect ratio. Photographs of the same make, model, size and focal
+    length share a camera, as do the frames of a video.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ class Photographs(Queries):
         hidden files, nested kapture folders and megloc outputs are skipped. The name of an image is
         its path below the given folder, or its file name; a frame is ``walk.mp4/000120.jpg``. A
         given kapture folder contributes its images and calibrated cameras.
-    camera : camera of all images, or a list of cameras by image; replaces the camera from EXIF.
+    camera : camera of all images, or a list of cameras by image; replaces EXIF and kapture cameras.
     every : take every n-th frame of a video; 30 by default.
     """
 
@@ -377,7 +377,7 @@ class Photographs(Queries):
             return ""
         more = f" and {len(names) - 5} more" if len(names) > 5 else ""
         return (
-            f"{len(names)} images are not in the list of cameras, their cameras are estimated: "
+            f"{len(names)} images are not in the list of cameras; their cameras are estimated: "
             f"{', '.join(names[:5])}{more}"
         )
 

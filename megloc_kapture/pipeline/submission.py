@@ -59,7 +59,7 @@ _Results = Mapping[str, LocalizationResult]
 
 
 def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
-    """Raise OptionError if the side tables are of another dataset, or if required but missing."""
+    """Raise OptionError if the side tables are of another dataset, or are required but missing."""
     check_known(dataset)
     plain = (KAPTURE, SYNTHETIC)
     wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
@@ -165,7 +165,7 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
     if from_rig:
         require(
             data.rigs,
-            "poses cannot be derived from the rig: neither queries nor result have a rigs.txt",
+            "poses cannot be derived from the rig: neither queries nor result has a rigs.txt",
             path=localized,
         )
         # from the camera with the most inliers; fallback poses are replaced, never propagated
@@ -234,7 +234,7 @@ def _mlad(results: _Results, tables: Path) -> _Content:
         query, reference = poses.get(pair.query), references.get(pair.reference)
         if query is None or reference is None:
             missing.append((f"{pair.file}: {pair.reference} {pair.query}", pair.query))
-            pose = RigidTransform.identity()  # same as kapture's exporter
+            pose = RigidTransform.identity()  # as in kapture's exporter
         else:
             posed.append(pair.query)
             pose = relative_pose(query, reference, scale=scale)
@@ -287,7 +287,7 @@ FOLDER = "submissions"
 def keep_submission(place: Path, folder: Path) -> Path:
     """Copy a submission and its provenance into a folder of submissions; return the copy's path.
 
-    Identical content is not copied again; name conflicts are numbered, ``..._METHOD-2.txt``.
+    Identical content is not copied again; a name that is taken gets a number, ``..._METHOD-2.txt``.
     """
     for path in (place, provenance_path(place)):
         require(path.exists(), "no such file; --from submission rewrites it", path=path)

@@ -15,7 +15,7 @@ from megloc_kapture.values import Options
 _BLOCK_ELEMENTS = 1 << 24  # similarities in memory, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # elements of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # largest number of rows in a block, even if vectors are short
-_GROUP = 8  # scores of which only the largest is used to find a bound of the best
+_GROUP = 8  # scores per group; the groups' maxima give a lower bound of the best scores
 Float32 = NDArray[np.float32]
 Similarities = NDArray[np.floating[Any]]
 Matrices = Sequence[Similarities]
@@ -32,7 +32,7 @@ class VectorRows(Protocol):
 
 
 def common_length(sources: Sequence[VectorRows]) -> int:
-    """Return the number of rows of all sources; DataError if they differ."""
+    """Return the common number of rows of the sources; DataError if they differ."""
     lengths = {source.shape[0] for source in sources}
     if len(lengths) != 1:
         raise DataError(
@@ -110,7 +110,7 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorRows) -> Float32:
 
 
 def _merge(best: Ranking, scores: Float32, first_query: int, first_row: int) -> None:
-    """Update the best rows so far by scores (q, b); blocks come in the database's order."""
+    """Update the best rows so far with scores (q, b); blocks come in the database's order."""
     block = slice(first_query, first_query + len(scores))
     best_rows, best_scores = (array[block] for array in best)
     top_k = best_rows.shape[1]
@@ -124,11 +124,11 @@ def _merge(best: Ranking, scores: Float32, first_query: int, first_row: int) -> 
 
 
 def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Return the ``count`` best of each row (q, b) and their columns; of ties, the first."""
+    """Return the ``count`` best scores (q, b) per row, and their columns; the first win ties."""
     height, width = scores.shape
     if width <= count:
         return scores, np.broadcast_to(np.arange(width), scores.shape)
-    # the maxima of groups are fewer, and as many scores as maxima reach a bound
+    # if ``count`` maxima of groups reach a bound, so do at least as many scores
     groups = width // _GROUP
     maxima = scores
     if groups > count:

@@ -93,10 +93,10 @@ def observed_keypoints(
 
 
 def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
-    """Add the map's median reprojection error, as an angle and in pixels, of a sample of images.
+    """Add the median reprojection error of a sample of map images, as an angle and in pixels.
 
     Points with a single observation are left out, because they reproject exactly onto it; if the
-    map has no others, the index is returned unchanged.
+    map has no others, or stores no keypoints, the index is returned unchanged.
     """
     if index.seen_once[index.point_ids].all() or index.local_type not in folder.types("keypoints"):
         return index
@@ -213,7 +213,7 @@ def poses_through_rig(
 class DepthRecord:
     """A depth map taken with an image.
 
-    ``path`` is below ``records_data``; ``image_from_depth`` maps depth camera frame to image frame.
+    ``path`` is below ``records_data``; ``image_from_depth`` is as in ``DepthView``.
     """
 
     path: str
