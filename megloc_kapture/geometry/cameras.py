@@ -18,7 +18,7 @@ PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
 RADIAL_MODELS = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 
 
-# model with one focal length -> model with two whose distortion parameters begin with the same ones
+# model with one focal length -> model with two, with the same distortion parameters first
 _TWO_FOCAL_MODEL = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
@@ -80,13 +80,13 @@ def with_two_focals(camera: Camera) -> Camera:
 
 
 def same_lens(first: Camera, second: Camera) -> bool:
-    """Return True if two cameras differ at most in focal lengths and principal points."""
+    """Return True if two cameras have the same distortion; all else may differ."""
     a, b = with_two_focals(first), with_two_focals(second)
     return a.model == b.model and a.params[4:] == b.params[4:]
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """Scale a camera to sides of whole pixels; parameters are scaled by the rounded sides."""
+    """Scale a camera to sides of whole pixels; focal lengths and principal point follow them."""
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     x, y = width / camera.width, height / camera.height
     params = list(camera.params)

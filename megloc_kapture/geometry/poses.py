@@ -34,8 +34,8 @@ _ALIGNING_PAIRS = 200  # enough: if half of the poses are correct, so is a quart
 _AGREEMENT_DEG = 5.0
 # largest distance of agreeing centres, as a share of the centres' median distance from their median
 _AGREEMENT_OF_SPREAD = 0.1
-# smallest spread of the positions in the second direction, in residuals, that determines the scale
-# and the axes
+# smallest spread of the positions along their second principal axis, as a multiple of the residual,
+# that determines the scale and the axes
 _MIN_SPREAD = 3.0
 # smallest assumed error of GPS positions: phone receivers claim no better, and the residuals of
 # three positions may be smaller by chance
@@ -385,7 +385,7 @@ READINGS: Sequence[Callable[[RigidTransform], RigidTransform]] = (
 def better_conventions(shares: Sequence[float]) -> list[str]:
     """Return the names of the conventions that explain far more than the poses as given.
 
-    ``shares`` of explained data are for :data:`READINGS`.
+    ``shares`` are the shares of data that each of :data:`READINGS` explains.
     """
     given, *others = shares
     best = max(others)

@@ -296,7 +296,7 @@ def _draw(depth, px, z, max_jump, inverse, front):
             visible[r, c] = math.isfinite(px[r, c, 0] + px[r, c, 1])
     for r in range(rows - 1):
         for c in range(columns - 1):
-            # divide the quad by its other diagonal where this one crosses a depth edge or a hole
+            # split along a diagonal with visible ends, preferably that with the smaller depth step
             falling = abs(depth[r, c] - depth[r + 1, c + 1])
             rising = abs(depth[r, c + 1] - depth[r + 1, c])
             whole = visible[r, c] and visible[r + 1, c + 1]

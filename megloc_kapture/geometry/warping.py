@@ -26,7 +26,7 @@ from megloc_kapture.geometry.cameras import (
 from megloc_kapture.plugins import DepthView, RankingScene
 from megloc_kapture.values import Camera, RigidTransform
 
-_NEAR_M = 0.02  # surfaces nearer to the camera of the view are clipped
+_NEAR_M = 0.02  # surfaces nearer than this to the view's camera are not drawn
 # references see the same surface if their depths in the view differ by less than this share
 _SAME_SURFACE = 0.02
 _MAX_JUMP = 0.05  # largest step between neighbouring depths of a surface, as a share of the nearer

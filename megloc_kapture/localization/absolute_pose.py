@@ -39,7 +39,7 @@ _MAX_CONDITION = 1e12
 _MAX_STEPS = 20
 # iteration ends below this squared length of a step, in standard deviations
 _LAST_STEP = 1e-5
-# initial damping after a rejected step
+# smallest damping after a rejected step
 _DAMPING = 1e-4
 # RANSAC of absolute poses
 _MIN_ITERATIONS, _MAX_ITERATIONS, _CONFIDENCE = 100, 20_000, 0.9999

@@ -62,7 +62,7 @@ _MAX_DEVIATIONS = 3.0
 _DOUBTED_DEVIATION, _MIN_DOUBTED = 0.7, 0.1
 # prior standard deviations: principal point as a share of the longer side, radial distortion
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
-# standard deviations of a calibrated focal length (relative) and of its radial distortion
+# standard deviations of a calibrated camera's focal length (relative) and radial distortion
 _CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
 # effective number of independent matches
 _INDEPENDENT = 30

@@ -29,10 +29,10 @@ class MapIndex:
     xyz : float64 (N, 3), points in the world.
     row_of_image : row of ``offsets`` by image name.
     offsets : int64 (I + 1,); rows offsets[i] to offsets[i + 1] are image i's observations.
-    keypoint_ids, point_ids : int32 (O,), ascending within an image.
+    keypoint_ids, point_ids : int32 (O,), within an image sorted by keypoint, then point.
     covariances : float64 (N, 6) as xx, xy, xz, yy, yz, zz for a noise of 1 px, NaN if unknown; or
         None.
-    noise_rad, noise_px : median reprojection error of the map as angle and in pixels; NaN if
+    noise_rad, noise_px : median reprojection error of the map as an angle and in pixels; NaN if
         unknown.
     """
 
@@ -214,7 +214,7 @@ class TypedMatches:
         )
 
     def are_with(self, images: Sequence[str]) -> NDArray[np.bool_]:
-        """Return a mask (M,) of the observed matches with a subset of the images."""
+        """Return a mask (M,) of the observed matches with any of these images."""
         members = set(images)
         asked = np.array([image in members for image, _, _ in self.matches], bool)
         return np.asarray(asked[self.observed[3]])
