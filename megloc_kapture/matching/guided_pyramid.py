@@ -244,7 +244,7 @@ def verify_best_first(
     matches: NDArray[np.int64],
     scores: NDArray[np.floating[Any]],
 ) -> NDArray[np.bool_]:
-    """Verify matches (N, 2), passed in the order of descending scores (N,).
+    """Verify matches (N, 2), passed to ``verify`` in the order of descending scores (N,).
 
     The returned mask (N,) is in the order of ``matches``.
     """

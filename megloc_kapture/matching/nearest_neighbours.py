@@ -76,7 +76,7 @@ def _search(
     """Return each row's best column and its value, each column's best value, and each row's
     second-best column.
 
-    With ``mutual``, the latter is set only for rows whose match may still be mutual.
+    With ``mutual``, the last is set only for rows whose match may still be mutual.
     """
     best = np.empty(len(a), dtype=np.int64)
     similarity = np.empty(len(a), dtype=np.float32)

@@ -39,7 +39,7 @@ class PairNetwork(Checkpointed[PairOptions], ABC):
 
     @abstractmethod
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
-        """Match one image with several in one batch; see :meth:`match`."""
+        """Match one image with several, in one batch if possible; see :meth:`match`."""
 
 
 def _matched(
@@ -137,7 +137,7 @@ class LightGlueOptions(NetworkOptions):
 
 
 class LightGlue(PairNetwork[LightGlueOptions]):
-    """Matcher ``lightglue`` by kornia, for the features that its weights were trained on.
+    """Matcher plugin ``lightglue`` by kornia, for the features that its weights were trained on.
 
     Each pair is matched separately, without padding.
     """
@@ -204,7 +204,7 @@ class LighterGlueOptions(LightGlueOptions):
 
 
 class LighterGlue(LightGlue):
-    """Matcher ``lighterglue`` for features of type ``xfeat``."""
+    """Matcher plugin ``lighterglue`` for features of type ``xfeat``."""
 
     Options = LighterGlueOptions
     _load: Any = staticmethod(load_lighterglue)

@@ -17,7 +17,7 @@ from megloc_kapture.values import RigidTransform
 # sensors have such errors
 _MAX_ERROR_SHARE = 0.02
 _AGREEING = 0.5  # the poses of a pair are correct if this share of its matches fits them
-# an image is wrong if a larger share of its matches contradicts its pose, a map is wrong if a
+# an image is wrong if a larger share of its matches contradicts its pose; a map is wrong if a
 # larger share of its images is wrong
 _MOST = 0.5
 # pairs with a smaller share of the usual number of matches may only look alike, and are left out
@@ -67,7 +67,7 @@ def count_fitting(
 
 
 def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None:
-    """Return a message, and True if it concerns most images; None without a contradiction."""
+    """Return a message, and True if the map should be rejected; None without a contradiction."""
     if not pairs:
         return None
     total = sum(pair.num for pair in pairs)

@@ -85,7 +85,7 @@ def _extended(
 class KeypointUnion:
     """Base keypoints float32 (N, C), followed by added ones with their ``descriptors`` (D,).
 
-    A keypoint within a pixel of existing keypoints counts as identical to the nearest of them.
+    A keypoint is identical to the nearest one within a pixel; base keypoints precede added ones.
     """
 
     def __init__(self, base: Float32) -> None:

@@ -36,7 +36,7 @@ _SAMPLE = 5  # matches that determine a relative pose
 _THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best result counts
 # largest expected number of false alarms; strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
-# about the largest number of mismatched pairs that give the probability of a wrong match
+# how often a wrong match agrees is measured on about this many mismatched pairs at most
 _MAX_WRONG_PAIRS = 20_000
 # a pair with fewer verified matches counts as not overlapping
 MIN_MATCHES = 15
@@ -191,7 +191,7 @@ def two_view_of_variants(
     base_matches: NDArray[np.int64],
     options: TwoViewOptions,
 ) -> PairVerifier:
-    """Return a two-view verifier; variants must agree with the model of the best variant.
+    """Return a two-view verifier; variants must agree with the model of the most matches.
 
     Keypoints are (N, 2 or more) and (M, 2 or more); ``base_matches`` int64 (K, 2) are the verified
     matches of the images themselves.
@@ -200,8 +200,8 @@ def two_view_of_variants(
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
 
     def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        # errors are measured at the mean focal length of the originals, where a pixel of a pair
-        # with a reduced variant is larger by this factor
+        # errors are measured at the mean focal length of the originals; a reduced variant lowers
+        # the mean, which makes a pixel larger by this factor
         coarser = (focal + other_focal) / (_precision(features.variant) * focal + other_focal)
         return verify_two_view(
             features.keypoints_px[matches[:, 0], :2],
@@ -305,7 +305,7 @@ def _ransac(
     sampling: dict[str, Any],
     refinement: dict[str, Any],
 ) -> tuple[Any, dict[str, Any]]:
-    """Estimate poselib's relative pose of normalised coordinates, which need no camera model."""
+    """Estimate a relative pose with poselib; normalised coordinates need no lens model."""
     import poselib
 
     pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}

@@ -21,7 +21,7 @@ _FLAT = np.float32(1e-6)  # a window with a smaller variance has no texture
 def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
     """Return the weighted ZNCC over the part of a window that lies inside a source image.
 
-    The result is -2 if that part has less than half of the weight.
+    The result is -2 if that part has less than half of the weight, or no texture.
     """
     height, width = source.shape
     total, r, r2, s, s2, sr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

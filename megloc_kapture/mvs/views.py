@@ -30,8 +30,8 @@ _MIN_REGION_PX = 40  # in smaller islands, views agree by chance
 # number of other views that must confirm a pixel; with 2, a tenth of the pixels are lost, and the
 # share of depths with an error below 2 cm rises by only one percent
 _MIN_VIEWS = 1
-# views agree within this distance of a pixel from its projection to another view and back, and this
-# relative difference in depth per pixel of that distance (docs/experiments/mvs.md)
+# views agree if a pixel projected to another view and back returns within this distance, and the
+# depths differ by at most this share per pixel of this tolerance (docs/experiments/mvs.md)
 TOLERANCE_PX, _RELATIVE_PER_PX = 1.0, 0.01
 # largest relative standard deviation of depth; surfaces without texture exceed it
 _MAX_RELATIVE_SIGMA = 0.03
@@ -106,7 +106,7 @@ def stereo_view(
 
 
 def _undistortion(lens: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], ...]:
-    """Return array coordinates x and y, float32 (H, W), in the lens image of a pinhole's pixels."""
+    """Return array coordinates x and y, float32 (H, W), of a pinhole's pixels in the lens image."""
     fx, fy, cx, cy = pinhole.params
     u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     rays = np.stack([(u.ravel() - cx) / fx, (v.ravel() - cy) / fy, np.ones(u.size)], axis=1)
