@@ -122,7 +122,7 @@ class FieldTrainer:
         progress: Callable[[int, float, list[float]], None] | None = None,
         keep: Callable[[bytes], None] | None = None,
     ) -> tuple[NeuralField, dict[str, float]]:
-        """Train to the last step; return the field and the PSNR in dB of each held-out image.
+        """Train to the last step or time limit; return the field and the held-out PSNR in dB.
 
         ``progress`` receives the step, the seconds and the PSNR in dB of the first two held-out
         images; ``keep`` receives the state.
@@ -176,7 +176,7 @@ class FieldTrainer:
 
 @contextmanager
 def _compiling() -> Iterator[None]:
-    """Enable torch.compile, with its cache keyed by processor.
+    """Enable torch.compile, with its cache keyed by the processor's instruction set.
 
     torch caches graphs by content only: a graph compiled for AVX2 writes out of bounds with
     AVX-512.

@@ -54,9 +54,9 @@ _SAME_VIEW_M, _SAME_VIEW_DEG = 0.2, 10.0
 class IcpOptions(Options):
     """Options of the refinement by ICP.
 
-    The last of ``max_distances_m`` is three standard deviations of a structured-light sensor's
-    depth at the end of its range, 4 m. The deviation is 0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen et
-    al., 3DIMPVT 2012, eq. 4).
+    The last of ``max_distances_m`` is about three standard deviations of a structured-light
+    sensor's depth at the end of its range, 4 m. The deviation is 0.0012 + 0.0019 (z - 0.4)^2 m
+    (Nguyen et al., 3DIMPVT 2012, eq. 4).
     """
 
     voxels_m: tuple[float, ...] = Field(

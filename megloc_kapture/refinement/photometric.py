@@ -206,7 +206,7 @@ class NormalEquations:
         return matrix, gradient, np.asarray(projection, np.float64)
 
     def step(self, damping: float) -> tuple[Float64, Float64, Float64] | None:
-        """Return steps of pose (6,), gains and biases (G, C); None where undetermined."""
+        """Return steps of pose (6,), gains and biases (G, C); None if undetermined."""
         reduced = self.reduced(damping)
         if reduced is None:
             return None
@@ -271,8 +271,8 @@ def _levenberg_marquardt(problem: LevelProblem, at: Alignment, last_step_px: flo
         pose_step, gain_step, bias_step = step
         trial = at.moved(perturbed(at.cam_from_world, pose_step), gain_step, bias_step)
         new = problem.system_at(trial, scale2)
-        # compare mean costs, so that points leaving the image do not look like an improvement
         small = float(np.abs(pose_step) @ reach) < last_step_px
+        # compare mean costs, so that points leaving the image do not look like an improvement
         if new.count >= MIN_POINTS and new.mean_cost < system.mean_cost:
             small = small or new.mean_cost > (1.0 - _LAST_GAIN) * system.mean_cost
             at, system = trial, new

@@ -219,7 +219,7 @@ def evaluated_equations(chosen, query, alignment, squared_scale, sums):
 def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths):
     """Assign points (N, 3) to cells of an image; keep each cell's smallest depth in ``nearest``.
 
-    ``cells`` (N,) is filled with flat cell indices, -1 outside the image, and ``depths`` (N,).
+    Fills ``cells`` (N,) with flat cell indices, -1 outside the image, and ``depths`` (N,).
     """
     columns = nearest.shape[1]
     shown_at = np.empty((11, min(len(points), _ROWS)))

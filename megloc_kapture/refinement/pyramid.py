@@ -52,7 +52,7 @@ class DepthPoints:
 
 
 def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
-    """Back-project those pixels of a depth map that its image sees, except at depth edges."""
+    """Back-project sampled pixels of a depth map that its image sees, except at depth edges."""
     if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
         raise DataError(
             f"a depth map of {depth.depth_m.shape} does not fit a camera of "
@@ -214,7 +214,7 @@ def _normalised(plane: Float32, used: Float32) -> Float32:
     share = np.maximum(_box_mean(used), np.float32(1e-3))
     mean = _box_mean(plane * used) / share
     centred = np.asarray(plane - mean, np.float32)
-    # each pixel's deviation is from the mean of its window, close to those of its neighbours
+    # each pixel is centred by the mean of its own window, which is close to its neighbours' means
     variance = _box_mean(centred * centred * used) / share
     floor = _FLAT * float(np.average(variance, weights=used)) if used.any() else 0.0
     result = centred / np.sqrt(variance + np.float32(max(floor, 1e-8)))

@@ -86,7 +86,7 @@ class RenderingRefinement:
     ) -> PoseRefinement:
         """Judge a pose from another method, after alignment at the finest level.
 
-        ``judged`` bool (H, W) are the image's pixels that acceptance uses, by default all.
+        ``judged`` bool (H, W) are the pixels over which the poses are compared, by default all.
         """
         seen, overlap = self._visibility(pose)
         if overlap < self.least_overlap:
