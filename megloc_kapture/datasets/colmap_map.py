@@ -1,7 +1,7 @@
 """A COLMAP model as a kapture map: cameras, rigs, poses, points, features; images are linked.
 
-Keypoints and descriptors come from the model's database. Without a database, SIFT is extracted
-again from the images, and observations are assigned to the new keypoints.
+Keypoints and descriptors come from the model's database. Without descriptors there, SIFT is
+extracted from the images, and observations are assigned to the new keypoints.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class ColmapReconstruction:
     data : sensors, rigs, records and poses. Timestamps are frame ids, or image ids if the model
         has no frames or a frame has two images of a camera.
     names : name in the model -> name in kapture.
-    scales : name in kapture -> (x, y) scale, for images of another size than in the model.
+    scales : name in kapture -> (x, y) scale, for images whose size differs from the model's.
     """
 
     source: ColmapFolders
@@ -263,7 +263,7 @@ class ColmapReconstruction:
 
 @contextmanager
 def naming_lasting_files(temporary: Path, model: Path) -> Iterator[None]:
-    """Make errors about a temporary file name the file that it links to, or else the model."""
+    """In errors about a temporary file, name the file that it links to, or else the model."""
     try:
         yield
     except DataError as error:
@@ -305,7 +305,7 @@ def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
 
 
 def kapture_data(model: ColmapModel, names: dict[str, str]) -> KaptureData:
-    """Return sensors, multi-camera rigs, records and poses; ``names`` are kapture names."""
+    """Return sensors, multi-camera rigs, records and poses; ``names`` maps to kapture names."""
     data = KaptureData()
     sensor_of = {camera_id: f"cam{camera_id}" for camera_id in sorted(model.cameras)}
     for camera_id, camera in model.cameras.items():

@@ -77,7 +77,7 @@ def checked_folders(
     _map_poses(mapping)
     require(query_data.records_camera, "there are no query images", path=query.root)
     photographs = query.root / "sensors" / "records_data"
-    require(photographs.is_dir(), "no such folder, which has the images", path=photographs)
+    require(photographs.is_dir(), "no such folder; it must have the images", path=photographs)
     renamed = map(prefixed(query_prefix), query_data.image_names())
     shared = sorted(set(map_data.image_names()) & set(renamed))
     if shared:
@@ -92,7 +92,7 @@ def checked_folders(
 def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") -> dict[str, float]:
     """Check the folders of ``root``, rewrite them below ``output``, and link the images.
 
-    ``query_prefix`` is prepended to query names if map and queries share names.
+    ``query_prefix`` is prepended to all query names, so that map and queries share none.
     """
     mapping, map_data, query, query_data = checked_folders(root, query_prefix)
     rename = prefixed(query_prefix)
@@ -176,8 +176,8 @@ def cameras_of_images(
 ) -> tuple[dict[Key, Camera], list[DataError]]:
     """Compare cameras with the image sizes in the files' headers; unreadable files are skipped.
 
-    Return the scaled cameras and the errors. A camera is scaled if the sizes of its images include
-    a single multiple of its size, up to rounding. Every image of another size gives an error.
+    Return the scaled cameras and the errors. A camera is scaled if exactly one of the sizes of its
+    images has its aspect ratio, up to rounding. Every image of another size gives an error.
     """
     of_camera: dict[Key, dict[tuple[int, int], list[Path]]] = {}
     for key, path in images:

@@ -27,7 +27,7 @@ _ROWS = 50_000  # points parsed at once
 class NvmModel:
     """A model of C images; the image ids of ``points`` are positions in ``names``.
 
-    Rotations ``quat_wxyz`` (C, 4) are from world to camera, camera ``centers`` (C, 3) are in the
+    Rotations ``quat_wxyz`` (C, 4) are from world to camera; camera ``centers`` (C, 3) are in the
     world frame. ``k_colmap`` (C,) is the distortion parameter of SIMPLE_RADIAL.
     """
 

@@ -208,7 +208,7 @@ def last_part(image: str) -> str:
     return PurePosixPath(image).name
 
 
-# kapture's guide to converting Aachen puts them into kapture/ next to the official files
+# kapture's guide to converting Aachen puts the folders into kapture/ next to the official files
 _PARENTS = (".", "kapture")
 _FOLDERS = ("mapping", "query_day", "query_night", "query")
 _FOLDERS_OF_LOCATIONS = ("[0-9][0-9]/mapping", "[0-9][0-9]/query")
@@ -216,7 +216,7 @@ _FOLDERS_OF_LOCATIONS = ("[0-9][0-9]/mapping", "[0-9][0-9]/query")
 
 @dataclass(frozen=True, slots=True)
 class KaptureImage:
-    """An image with its kapture data; ``locations`` are numbers of three digits, as ``001``."""
+    """An image with its kapture data; ``locations`` are three-digit numbers such as ``001``."""
 
     name: str
     file: Path

@@ -83,7 +83,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         return np.empty((0, 2), np.float32) if rows is None else np.ascontiguousarray(rows[:, :2])
 
     def feature_type(self) -> tuple[str, str] | None:
-        """Return the type of all features, or None without descriptors."""
+        """Return type name and dtype of all features, or None without descriptors."""
         with self._reading():
             columns = self._rows("PRAGMA table_info(descriptors)")
             if any(column[1] == "type" for column in columns):
@@ -132,7 +132,7 @@ _MAX_SHIFT_PX = 1.0
 
 
 def published_database(path: Path | None, remarks: list[str]) -> Path | None:
-    """Return the feature database of a published model; if it is missing, None, adding a remark."""
+    """Return the feature database of a published model, or add a remark and return None."""
     if path is not None and path.is_file():
         return path
     remarks.append(
@@ -170,7 +170,7 @@ def write_reference_map(
     image_names : name in ``data`` of each image of the model, in model order.
     database : COLMAP database with the names of ``image_names``, up to their suffixes.
     database_names : names in the database, by image, that differ from ``image_names``.
-    scales : (x, y) scale of images whose camera in ``data`` has another size than in the model.
+    scales : (x, y) scale of images whose camera in ``data`` differs in size from the model's.
     """
     write_sensors(output, data)
     link_records(output, links)

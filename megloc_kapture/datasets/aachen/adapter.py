@@ -161,7 +161,7 @@ class Layout:
     def _centred(self, nvm: NvmModel, position: int) -> Camera:
         """Return the NVM's camera with a centred principal point.
 
-        No image is known whose published camera differs from it.
+        No published camera is known to differ from it.
         """
         name = nvm.names[position]
         width, height = image_size(self.images / name)
@@ -191,7 +191,7 @@ def _first(folders: Iterable[Path]) -> Path:
 def from_kapture(
     form: KaptureForm, wanted: Wanted, missing: Missing
 ) -> tuple[AachenImages, dict[str, Path]]:
-    """Return the images of kapture folders in the official order, and the file of each."""
+    """Return the images of kapture folders, numbered as official ones, and the file of each."""
     kapture_images = form.read(missing)
     images = AachenImages(_version_of(form, wanted, kapture_images))
     cameras: dict[str, int] = {}
@@ -237,7 +237,7 @@ class AachenOptions(Options):
 
     version: Wanted = Field(
         default="auto",
-        description="version of the dataset; auto: 1.1 if 3D-models/aachen_v_1_1 exists",
+        description="version; auto: 1.1 if its model or, in kapture folders, its images exist",
     )
     reference_model: bool = Field(
         default=False, description="import the SIFT model too, as a kapture map in reference/"
@@ -297,7 +297,7 @@ class Aachen:
         if images.version == "1.0" and not layout.database_intrinsics.is_file():
             remarks.append(
                 f"Without {layout.database_intrinsics.name}, the principal points of map images "
-                "are assumed at the image centres, and the image sizes are read from the files."
+                "are assumed to be the image centres, and the image sizes are read from the files."
             )
         if left_out:
             remarks.append(

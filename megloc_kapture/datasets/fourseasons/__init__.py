@@ -1,6 +1,6 @@
 """4Seasons' recordings on disk, their text files, and those of the MLAD challenges.
 
-Commas or blanks separate fields, ``#`` begins a comment line. Timestamps are integer nanoseconds
+Fields are separated by commas or blanks; ``#`` begins a comment line. Timestamps are integers (ns)
 and are never converted to float, which would lose digits. Quaternions are x y z w.
 """
 
@@ -230,7 +230,7 @@ def _folders(root: Path) -> list[Path]:
 
 
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
-    """Find relocalization files; a file whose name lacks the source lies in the source's folder."""
+    """Find relocalization files; one whose name lacks the source must lie in its folder."""
     known = set(recordings)
     files: dict[str, RelocalizationFile] = {}
     for folder in _RELOCALIZATION_FOLDERS:
@@ -273,7 +273,7 @@ def select(
 ) -> Selection:
     """Choose recordings by name, or by relocalization files.
 
-    Without names and files, the first recording with poses is the map and all others are queries.
+    Without names or files, the first recording with poses is the map and all others are queries.
     """
     recordings = find_recordings(root)
     files = find_relocalization_files(root, recordings)

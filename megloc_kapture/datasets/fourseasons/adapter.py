@@ -257,7 +257,7 @@ def _image_groups(
 ) -> dict[str, ImageGroup]:
     """Return image groups; the condition of a query is its recording.
 
-    Only left images are scored and, if relocalization files select queries, only these.
+    Only left images are scored; of a recording with relocalization files, only those in the files.
     """
     groups = {
         image: ImageGroup(location=image.partition("/")[0]) for image in mapping.image_names()

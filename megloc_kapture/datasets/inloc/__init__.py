@@ -98,7 +98,7 @@ def read_wrong_scans(path: Path | str) -> frozenset[str]:
 
 
 def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.float64]:
-    """Read the scanned points float64 (height, width, 3), metres in the scan's frame, or NaN."""
+    """Read float64 (height, width, 3): scanned points in the scan's frame (metres), or NaN."""
     from scipy.io import loadmat
 
     with reading(path, f"a MAT file with {POINTS}"):

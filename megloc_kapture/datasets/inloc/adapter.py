@@ -43,11 +43,11 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 CUTOUTS, QUERIES, DEPTH = "database/cutouts", "query/iphone7", "depth"
 DATASET = "inloc"
-# focal length over the longer side: the iPhone 7 has a 28 mm lens in equivalents of 36 mm film
+# focal length over the longer side: the iPhone 7's is equivalent to 28 mm on film 36 mm wide
 _FOCAL_SHARE = 28 / 36
 # focal length over width, for a horizontal field of view of 60 degrees: 0.5 / tan(30 deg)
 _CUTOUT_FOCAL_SHARE = 3**0.5 / 2
-# the 277 scans of the paper's 9,972 cutouts, with the floors published by the authors
+# the 277 scans of the paper's 9,972 cutouts, by floor as published by the authors
 _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
 _PUBLISHED_QUERIES = 356
 

@@ -50,7 +50,7 @@ class ImageKey:
 
     @property
     def path(self) -> str:
-        """Return the path below ``images/`` without the file type."""
+        """Return the path below ``images/`` without the file suffix."""
         return f"{self.condition}/{self.camera}/{self.stem}"
 
 

@@ -265,7 +265,7 @@ def _image_groups(selection: Selection) -> dict[str, ImageGroup]:
 def _query_priors(
     selection: Selection, groups: Mapping[str, ImageGroup]
 ) -> dict[str, tuple[str, ...]]:
-    """Return the permitted map images of each query: same location (or unknown) and camera.
+    """Return the permitted locations of each query: its own and unknown ones, of its camera.
 
     A query without permitted map images keeps its locations as a prior, so that it is matched with
     no map image at all.

@@ -203,7 +203,7 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
             )
         require(
             cameras.setdefault(key.camera, image.camera) == image.camera,
-            f"camera {key.camera} differs from that of other images; all images of a side of the "
+            f"camera {key.camera} differs from that of other images; all images of one side of the "
             "car are rectified to the same camera",
             path=image.file,
         )
