@@ -39,7 +39,7 @@ def load_pycolmap() -> Any:
     # importing pycolmap replaces the SIGTERM handler; a terminated run would print a stack trace
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
-    pycolmap.logging.minloglevel = 2  # hide INFO lines
+    pycolmap.logging.minloglevel = 2  # hide INFO and WARNING lines
     return pycolmap
 
 
@@ -126,7 +126,7 @@ def focal_from_matches(
     max_error_px: float,
     seed: int,
 ) -> float | None:
-    """Estimate the focal length in pixels of an otherwise known camera by P4Pf in a RANSAC.
+    """Estimate the focal length in pixels of an otherwise known camera by P4Pf in RANSAC.
 
     Matches of ``points_px`` (N, 2) and ``points`` (N, 3) that are not finite are ignored. Return
     None if no pose has enough inliers.

@@ -39,8 +39,8 @@ from megloc_kapture.values import Camera, RigidTransform
 Mapper = Literal["incremental", "global"]
 _FOLDERS = {"depth": "depth_maps", "normal": "normal_maps"}
 MIN_IMAGES = 3
-# points that two images must share to be connected, and that a model must have: RANSAC may find
-# fewer inliers by chance, and COLMAP needs as many inliers to register an image
+# points that two images must share to be connected, and that a model must have: fewer may be chance
+# inliers of RANSAC, and COLMAP needs as many inliers to register an image
 _MIN_POINTS = 30
 # a photograph was taken with another zoom, or is a crop, if its separately estimated focal length
 # differs from the median by more than _OTHER_ZOOM (difference of logarithms) and its reprojection
@@ -124,7 +124,7 @@ def reconstruct(
     """Estimate poses and cameras from matches; return connected models, the largest first.
 
     ``matches`` are (M, 2) keypoint rows of pairs (i, j) of photographs. Two images are connected if
-    they share at least 30 points. Doubtful images with another focal length get separate cameras,
+    they share at least 30 points. Doubtful images with another focal length get new cameras,
     and the reconstruction is repeated. COLMAP runs in one thread to be deterministic.
     """
     pycolmap = load_pycolmap()

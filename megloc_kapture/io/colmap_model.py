@@ -183,7 +183,7 @@ def image_rows(text: str) -> Iterator[tuple[int, list[str], str]]:
 
 
 def _is_image(line: str) -> bool:
-    """Return whether a line is an image's, not its features, triples of numbers."""
+    """Return whether a line describes an image, not its features (triples of numbers)."""
     fields = line.split()
     return len(fields) >= 10 and (len(fields) % 3 != 0 or not FLOAT_PATTERN.fullmatch(fields[-1]))
 

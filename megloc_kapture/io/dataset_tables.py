@@ -194,8 +194,8 @@ class SideTables:
 
     An empty table has no file.
 
-    ``world`` transforms between the local frame, that of the map and the true poses, and the
-    official frame of pose files. ``names`` is the challenge's list, image -> name in a pose file;
+    ``world`` transforms between the local frame (of the map and the true poses) and the official
+    frame (of pose files). ``names`` is the challenge's list, image -> name in a pose file;
     ``relocalization`` has the image pairs of an MLAD challenge.
     """
 
@@ -207,7 +207,7 @@ class SideTables:
     world: World = World()
 
     def scored(self, images: Iterable[str]) -> set[str]:
-        """Return the images that count in recall and belong into the pose file."""
+        """Return the images that count in recall and belong in the pose file."""
         return {i for i in images if i not in self.groups or self.groups[i].scored}
 
     def conditions(self, images: Iterable[str]) -> dict[str, str]:

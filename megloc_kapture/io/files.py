@@ -123,7 +123,7 @@ def check_component(text: str) -> str:
     """Return ``text`` if it is a valid type name: a single folder name and a single CSV field."""
     check_relative(text)
     if "/" in text or "," in text or text != text.strip():
-        raise DataError(f"{text!r} cannot be a type name (slash, comma or space at the end)")
+        raise DataError(f"{text!r} cannot be a type name (slash, comma, or space at an end)")
     return text
 
 
@@ -251,7 +251,7 @@ def link_images(
 ) -> None:
     """Link ``sensors/records_data`` and ``sensors/masks`` of the output to those of the source.
 
-    With ``below``, the links are the folders of this name inside the two.
+    With ``below``, the links have this name inside the output's two folders.
     """
     for name in folders:
         source = Path(source_root).resolve() / "sensors" / name

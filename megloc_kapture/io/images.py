@@ -52,7 +52,7 @@ _LOSSLESS = (".pgm", ".pnm", ".gif", ".jp2")
 # images that use more than this fraction of their range are scaled, others are stretched
 _MIN_RANGE = 0.5
 _STRETCHED_PERCENT = (0.1, 99.9)
-# a depth map of whole numbers with larger ones is not in metres
+# a depth map of whole numbers, some larger than this, is not in metres
 _MOST_WHOLE_M = 100
 
 
@@ -219,7 +219,7 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
     known = depth_m[(depth_m > 0) & np.isfinite(depth_m)]
     require(
         not (known > _MOST_WHOLE_M).any() or (np.abs(known - np.rint(known)) > 1e-3).any(),
-        "all values are whole numbers, as of a 16-bit image in millimetres; give metres",
+        "all values are whole numbers, as in a 16-bit image in millimetres; give metres",
         path=path,
     )
     return depth_m
@@ -383,7 +383,7 @@ def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
 def _blank_with_exif(exif: Image.Exif, make: str, model: str, size: tuple[int, int]) -> bytes:
     """Return a blank JPEG with make, model and focal tags, for COLMAP to infer the focal length.
 
-    COLMAP reads only few image formats, and it would decode all pixels of the photograph.
+    COLMAP reads only a few image formats, and it would decode all pixels of the photograph.
     """
     from PIL import Image
     from PIL.TiffImagePlugin import IFDRational

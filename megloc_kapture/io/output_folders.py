@@ -1,8 +1,8 @@
 """Output folders of commands: ownership, and output that appears only on success.
 
 A command may write to a folder that is new, empty, or marked as a folder of the command's kind. The
-mark is a file with this kind and the files that the last command wrote; the next command replaces
-these files.
+mark is a file that lists this kind and the files written by the last command; the next command
+replaces these files.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 ==================== =============================================================================
 status.csv           outcome of every query: reason, numbers of matches and inliers, confidence
-poses.csv            every pose and its camera centre, written by ``stages/query_poses.py``
+poses.csv            every pose and its camera centre, written by ``stages/localized_folder.py``
 clusters.csv         clusters of candidates that were tried for every query, and their poses
 covariance.csv       covariance of every localized pose that has one
 refinement.csv       outcome of refining each query's pose, step by step
@@ -144,7 +144,7 @@ def write_covariances(path: Path, results: Iterable[LocalizationResult]) -> None
 
 
 def write_clusters(path: Path, results: Iterable[LocalizationResult]) -> None:
-    """Write ``clusters.csv``, sorted by image: the clusters of each result with unrefined poses."""
+    """Write ``clusters.csv``, sorted by image: each result's clusters with unrefined poses."""
     columns = ("image", "cluster", "chosen", "num_matches", "num_inliers", "score", "reason")
     rows = [
         (

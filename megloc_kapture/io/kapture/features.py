@@ -78,7 +78,7 @@ def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: boo
 
 
 def has_features(root: Path, kind: ArrayKind, type_name: str, image: str) -> bool:
-    """Return whether an image has features in a folder of the orphan layout."""
+    """Return whether an image has a feature file (not in a tar) in the orphan layout."""
     folder = feature_folder(root, kind, type_name, orphan=True)
     return (folder / f"{check_relative(image)}{SUFFIX[kind]}").is_file()
 

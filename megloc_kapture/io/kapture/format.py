@@ -151,7 +151,7 @@ class KaptureData:
 
 
 def _shortest(value: float) -> str:
-    """Return the shortest text of a float64; whole numbers have no point, as in kapture."""
+    """Return the shortest text of a float64; whole numbers have no decimal point, as in kapture."""
     value = float(value)
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
@@ -196,7 +196,7 @@ def check_field(name: str) -> str:
     """Return an image name if it is a plain path and a valid CSV field; raise DataError if not."""
     check_relative(name)
     if "," in name or name != name.strip():
-        raise DataError(f"image name {name!r} has a comma or a space at its end")
+        raise DataError(f"image name {name!r} has a comma, or a space at an end")
     return name
 
 

@@ -128,7 +128,7 @@ class ImagePair:
 def read_pairs(path: Path | str) -> list[ImagePair]:
     """Read a pairs file in its order, without repeated pairs.
 
-    Pairs without a score (hloc separates the two names by a blank) have the best one first.
+    Pairs without a score (in hloc's files, two names separated by a blank) rank in this order.
     """
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()

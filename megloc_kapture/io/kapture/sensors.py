@@ -1,7 +1,7 @@
 """Tables in a kapture's ``sensors/``: sensors, rigs, trajectories and records.
 
-Floats are written with as many digits (up to 17) as restore the same float64. kapture allows
-partial poses: rows whose whole rotation or whole translation is blank are skipped, other blanks are
+Floats are written with the fewest digits (up to 17) that restore the same float64. kapture allows
+partial poses: rows whose whole rotation or whole translation is blank are skipped; other blanks are
 errors.
 """
 

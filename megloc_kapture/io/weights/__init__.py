@@ -382,7 +382,7 @@ def add_weights(
 
 
 def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
-    """Convert a checkpoint to safetensors with its sha256; return the number of tensors."""
+    """Convert a checkpoint to safetensors, its sha256 as metadata; return the number of tensors."""
     from safetensors.torch import save
 
     check_option(
