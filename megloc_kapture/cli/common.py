@@ -1,4 +1,4 @@
-"""Flags shared by commands, with the names that kapture's tools use, and their messages."""
+"""Flags and messages shared by commands; flags are named as in kapture's tools."""
 
 from __future__ import annotations
 

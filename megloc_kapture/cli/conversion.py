@@ -71,7 +71,7 @@ class Import(Common):
     set: Texts = ()
     """An option of the dataset: key=value (version=1.0, reference_model=true); may be repeated."""
     query_prefix: str = ""
-    """Put the queries into a folder of this name, if they share names with map images."""
+    """Folder to put the queries into; needed if they share names with map images."""
     force: Overwrite = False
     """Write into a non-empty folder; for colmap: accept poses that contradict the matches of their
     images."""

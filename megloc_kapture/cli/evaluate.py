@@ -43,13 +43,13 @@ class Evaluate(Common):
     thresholds: tuple[str, ...] = ()
     """Recall thresholds in metres and degrees, for example 0.25,2 0.5,5."""
     align: Literal["none", "se3", "sim3"] = "none"
-    """Align the poses with the truth first, as evo does: sim3 with scale, for maps in an arbitrary
-    frame and scale; se3 without scale. The alignment ignores outliers."""
+    """Align the poses with the truth first: sim3 with scale, for maps in an arbitrary frame and
+    scale; se3 without scale. Unlike evo's, the alignment ignores outliers."""
     side_tables: Path | None = None
     """The workspace's megloc/ folder (conditions, protocol); if omitted, the megloc/ folder next to
     the true poses or the results."""
     map: Path | None = None
-    """Kapture folder of the map, for the report; if omitted, the workspace's."""
+    """Kapture folder of the map, for MLAD's pairs and the report; if omitted, the workspace's."""
     force: Force = False
 
     def run(self) -> None:

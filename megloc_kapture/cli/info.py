@@ -144,7 +144,7 @@ def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
         known = folder.read().sensors[sensor_id].camera()
         yield (
             f"the images of camera {sensor_id} are {camera.width}x{camera.height}, scaled from the "
-            f"{known.width}x{known.height} of the camera and of keypoints"
+            f"{known.width}x{known.height} to which the camera and keypoints refer"
         )
     if errors:
         yield f"{len(errors)} images differ in size from their cameras, the first: {errors[0]}"

@@ -144,7 +144,7 @@ class Localize(Reading, Deciding, Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(Reading, Deciding, Common):
-    """Localize images that clients send over HTTP in a kapture map; has a page for photographs."""
+    """Serve localization in a kapture map over HTTP, with a web page for photographs."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""

@@ -128,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(DONE)
         import tyro
 
-        if isinstance(sys.stdout, TextIOWrapper):  # results appear at once, also in a pipe
+        if isinstance(sys.stdout, TextIOWrapper):  # results appear at once, even in a pipe
             sys.stdout.reconfigure(line_buffering=True)
         command = tyro.cli(
             _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)

@@ -49,7 +49,7 @@ class Train(Common):
     held_out: Folders = ()
     """Kapture folder with poses and depth to evaluate on; may be repeated."""
     output: Output
-    """File to write: X.safetensors; also writes X.json, X.csv and X.state.pt."""
+    """File to write: X.safetensors; also writes X.json, X.csv, X.state.pt and X.overlaps."""
     features: str | None = None
     """Extractor whose features are matched, or whose detector is frozen; if omitted, superpoint."""
     set: Texts = ()
@@ -182,7 +182,7 @@ class Render(Working):
     (merge them with kapture_merge); views with less than half of their pixels on the scene are
     omitted."""
     max_side: int | None = None
-    """For --along and --between: longer side of the renderings, px; larger cameras are reduced."""
+    """For --along and --between: longer side of the renderings, px; larger ones are reduced."""
     appearance: str | None = None
     """Training image whose lighting is used; if omitted, the mean lighting of all."""
     force: Overwrite = False
