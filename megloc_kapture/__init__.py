@@ -72,7 +72,7 @@ __all__ = [
     "train",
 ]
 
-# lazy: importing an error class does not import numpy, importing a value type not the solvers
+# lazy: an error class does not import numpy, and a value type does not import the solvers
 _LAZY = {
     "values": ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"),
     "pipeline.kapture_map": ("KaptureMap",),

@@ -163,7 +163,7 @@ class Map:
             a camera, an image is rotated upright by its EXIF orientation, and its focal length is
             initialised from EXIF or a guess and estimated with the pose, see ``Pose.camera``.
         prior : names of the map images to match with one image.
-        refine : names of pose refiners, applied in order: icp, rendering.
+        refine : names of pose refiners, applied in order: icp, rendering, field.
         workers : threads, for lists and folders.
         """
         if isinstance(query, str):
@@ -190,7 +190,7 @@ class Map:
 
 
 def check_image(image: Any) -> None:
-    """Raise DataError for other things than images, such as tensors, or None from cv2.imread."""
+    """Raise DataError for anything but an image, such as a tensor, or None from cv2.imread."""
     from PIL import Image
 
     kind = type(image).__name__
@@ -380,7 +380,7 @@ def run(
 
     Parameters
     ----------
-    root : the dataset as published; searched below MEGLOC_DATA by default.
+    root : the dataset as published; by default, it is looked for below MEGLOC_DATA.
     preset : by default the preset in the dataset's benchmark file.
     workspace : ``runs/DATASET-PRESET`` by default, and ``runs/kapture-ROOT-PRESET`` for kapture
         folders.
@@ -400,8 +400,8 @@ def extract(
 ) -> ImageFeatures:
     """Extract local features of an image with a named extractor.
 
-    ``image`` is as in :meth:`Map.localize`; ``options`` are the extractor's. PluginError or
-    MissingWeightsError if the extractor cannot be loaded.
+    ``image`` is one image as in :meth:`Map.localize`, but never rotated; ``options`` are the
+    extractor's. PluginError or MissingWeightsError if the extractor cannot be loaded.
     """
     check_image(image)
     if isinstance(image, str | Path):
@@ -478,7 +478,7 @@ def train(
     kaptures, held_out : kapture folders with poses and depth, for training and for evaluation.
     photographs : folders of images, for training with random homographies.
     features : name of the extractor whose features are matched, or whose detector is frozen.
-    set : options, as ``{"steps": 20000}``.
+    set : options, such as ``{"steps": 20000}``.
     """
     from megloc_kapture.training.train import TASKS
     from megloc_kapture.training.train import train as run_training

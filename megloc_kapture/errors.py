@@ -60,7 +60,7 @@ class OutputError(MeglocError):
 
 
 class PluginError(MeglocError):
-    """A plugin is unknown, cannot be loaded, or does not implement its protocol."""
+    """A plugin is unknown, cannot be loaded, rejects its options, or violates its protocol."""
 
 
 def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> str:

@@ -140,7 +140,7 @@ def evaluate_results(
         true_poses: Poses = result_in_memory(truth).poses
     else:
         true_poses = read_poses(Path(truth))
-        require(true_poses, "has no poses, as true poses should", path=truth)
+        require(true_poses, "has no poses, but true poses are needed", path=truth)
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
     relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.relocalization)
@@ -218,7 +218,7 @@ def _read(
         if isinstance(source, Mapping):
             result = result_in_memory(source, label=label)
         else:
-            # without known names, pose files may spell those of the first result differently
+            # if none are known, take those of the first result: pose files may spell them otherwise
             names = images or (read[0].images if read else ())
             result = read_result(
                 source, benchmark, images=names, references=references, label=label
@@ -230,7 +230,7 @@ def _read(
 def _by_names_of_results(
     true_poses: Poses, results: Sequence[Result], known: Collection[str]
 ) -> Poses:
-    """Rename the true poses if results and truth have no image name in common (other folders)."""
+    """Rename the true poses if their folders differ from the results', so that no names match."""
     images = {image for result in results for image in result.images}
     if not images & true_poses.keys():
         true_poses = poses_by_image(true_poses, images)

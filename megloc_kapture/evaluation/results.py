@@ -146,7 +146,7 @@ class Result:
     images : queries of the result, sorted; for a pose file only those with a pose.
     statuses : of a pose file, only the confidences in the JSON file next to it.
     covariances : image -> (6, 6), as in ``Pose``.
-    by_pair : pair -> ``cam_from_world`` of its query, if the result is MLAD's pose files.
+    by_pair : pair -> ``cam_from_world`` of its query, if the result consists of MLAD pose files.
     """
 
     label: str
@@ -312,7 +312,7 @@ def _read_mlad(
             if asked_pair.reference not in references:
                 problem = f"reference {asked_pair.reference!r} has no pose in the map"
                 raise DataError(problem, path=pose_file)
-            # the identity fills in for a missing pose: the file must have every row
+            # the identity stands in for a missing pose: the file must have every row
             if pose != RigidTransform.identity():
                 local = pose_files.scaled_pose(pose, 1 / world.official_from_local.scale)
                 poses[asked_pair] = local @ references[asked_pair.reference]

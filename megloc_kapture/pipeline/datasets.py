@@ -79,13 +79,13 @@ class DatasetChoice:
             (check_root if self.adapter is None else self.adapter.check)(self.root)
 
     def has_truth(self) -> bool:
-        """Return False for kapture folders without true poses, else True (they may have them)."""
+        """Return False for kapture folders without true poses; others may have them (True)."""
         if self.root is None or self.adapter is not None:
             return True
         return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
 
     def has_query_depth(self) -> bool:
-        """Return whether kapture folders have query depth, by a rig; False for other datasets."""
+        """Return whether a rig links depth maps to the queries (of kapture folders; else False)."""
         if self.root is None or self.adapter is not None:
             return False
         return _has_depth(self.root / QUERY)
@@ -110,7 +110,7 @@ class DatasetChoice:
         return input_files(root) if self.adapter is None else files_below(root)
 
     def rehearse(self) -> None:
-        """Raise the errors of an import without writing anything."""
+        """Raise the errors that an import would raise, without writing anything."""
         if self.root is None:
             return
         root = self.root.resolve()
@@ -170,7 +170,7 @@ def choose_dataset(
     allow_missing: bool = False,
     find_root: bool = True,
 ) -> DatasetChoice:
-    """Return a dataset by name; without ``root``, its folder is searched below MEGLOC_DATA.
+    """Return a dataset by name; without ``root``, look for its folder below MEGLOC_DATA.
 
     If ``find_root`` is false, an official dataset may lack a root and then cannot be imported.
     """

@@ -131,7 +131,7 @@ def choose_run(
 
     Parameters
     ----------
-    root : published dataset folder; searched below MEGLOC_DATA by default.
+    root : published dataset folder; by default, it is looked for below MEGLOC_DATA.
     assignments : the user's changes: ``key.key=value`` texts, or a mapping from ``key.key`` to
         values.
     import_options : dataset options, applied after those of the benchmark file.

@@ -68,8 +68,8 @@ _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
 class ExportedImage(MapImage):
     """An exported image with its observations.
 
-    They are ``rows`` of the keypoints, and ``points``, which are rows of the exported points; both
-    are int (M,).
+    Observation i joins keypoint ``rows[i]`` to the exported point ``points[i]``; both arrays are
+    int (M,).
     """
 
     path: Path
@@ -96,7 +96,7 @@ def export_colmap(images: Sequence[ExportedImage], points: Points, output: Path)
 def export_undistorted(images: Sequence[ExportedImage], points: Points, output: Path) -> None:
     """Write PINHOLE cameras, ``images/`` and ``sparse/0`` for Gaussian splatting.
 
-    ``/`` in image names becomes ``_``, because the original Gaussian splatting ignores folders.
+    ``/`` in image names becomes ``_``, as the original Gaussian splatting code ignores folders.
     """
     images = [replace(image, name=image.name.replace("/", "_")) for image in images]
     for image in images:

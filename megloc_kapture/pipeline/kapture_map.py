@@ -40,8 +40,8 @@ _SIFT_OF = {True: "sift", False: "rootsift"}
 class MapKeypoints:
     """Keypoints of one type in a map, in COLMAP's convention, and the points that they observe.
 
-    ``index`` holds points and observations as arrays, empty if the type has no points. For queries
-    with stored features, ``folder`` and ``name`` are theirs.
+    ``index`` holds points and observations as arrays, empty if the type has no points. For stored
+    features of queries, ``folder`` and ``name`` are those of the queries.
     """
 
     folder: KaptureFolder

@@ -150,8 +150,8 @@ class LocalType:
     def match_again(
         self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
     ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
-        """Match the best map images with the second matcher, and those with few matches by guided
-        pyramid matching, if these are enabled.
+        """If enabled, match the map images that ``second_matching`` selects with its matcher, then
+        those with few matches by guided pyramid matching.
 
         Return the query keypoints, followed by the added keypoints; the matches in the order of
         ``pairs``; and the reason if the pyramid or some of its variants were skipped, else "".
@@ -295,8 +295,8 @@ class _GlobalType:
 class MapMatching:
     """Preparation, retrieval, matching and reranking of queries against a map; thread-safe.
 
-    Retrieval uses the global features that both map and query have. Without any, it uses the types
-    in the options that are VLAD or stored in the map; without these, all types in the options.
+    Retrieval uses the global features that map and query share; if some are in the options, only
+    those. If none are shared, it uses the options' VLAD and stored types, or else all of them.
     Missing vectors of map images are computed in memory.
     """
 

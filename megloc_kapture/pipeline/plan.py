@@ -82,7 +82,7 @@ class Workspace:
         """Lock the workspace for this process.
 
         First remove leftovers of killed runs, except items of stages that resume. At the end remove
-        the workspace if it has no output, not even unfinished.
+        the workspace if it has neither finished nor unfinished output.
         """
         path = self.root / LOCK
         with writing(path):
@@ -92,8 +92,8 @@ class Workspace:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 raise OutputError(
-                    f"{self.root}: another run is using this workspace; wait for it or give "
-                    "another --workspace"
+                    f"{self.root}: another run is using this workspace; wait for it or use "
+                    "another workspace"
                 ) from error
             self._clear_partial()
             for folder in (self.root, self.root / "stages"):
@@ -124,10 +124,10 @@ class Workspace:
 
     @contextmanager
     def staging(self, stage: str, mark: str, *, resumes: bool = False) -> Iterator[Path]:
-        """Yield the folder to write a stage's output into; remove it on success.
+        """Yield the folder to write a stage's output into; remove it at the end.
 
-        A stage that ``resumes`` gets the folder of an interrupted run with the same ``mark``, its
-        fingerprint.
+        If a stage that ``resumes`` fails, its items are kept, for a run with the same ``mark`` (its
+        fingerprint) to continue.
         """
         place = self.partial_path(stage)
         with writing(place):

@@ -34,7 +34,7 @@ class Query:
         extracted.
     prior : map images that may be matched; None means all.
     candidates : map images to match, best first, instead of retrieval.
-    mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may not exist.
+    mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may be missing.
     depth : depth map taken with the image, or a function that reads one; for ``icp``.
     orientation : EXIF orientation of an image file, which is turned upright when it is read;
         ``camera`` describes the upright image.

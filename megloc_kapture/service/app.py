@@ -1,7 +1,7 @@
 """HTTP service that estimates the poses of uploaded images; see docs/serve.md.
 
-Errors are JSON, ``{"error": "..."}``. Client errors have a status from 400 to 499 and an explaining
-message; an internal error has the status 500, and its details are only logged.
+Errors are JSON, ``{"error": "..."}``. Client errors have a status from 400 to 499 and say what is
+wrong; 503 means too many waiting images, 500 an internal error whose details are only logged.
 """
 
 from __future__ import annotations
@@ -135,8 +135,8 @@ def read_camera(text: str) -> Camera:
 def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> ImageQuery:
     """Read a query from an image file's bytes and a camera as JSON.
 
-    The image's header is checked before decoding. HTTPException for another format (415) or too
-    many pixels (413), DataError for a broken image or camera.
+    The header is checked before decoding. HTTPException for another format or a broken header
+    (415) or too many pixels (413), DataError for other errors in the image or the camera.
     """
     try:
         image = Image.open(BytesIO(content), formats=["JPEG", "PNG"])

@@ -21,7 +21,7 @@ from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera
 
 _MAX_POINTS, _MAX_CAMERAS = 15_000, 3_000
-_SHUTDOWN_S = 60  # running requests may finish in this time; slow uploads are cut off
+_SHUTDOWN_S = 60  # running requests may finish within this time; slow uploads are cut off
 
 
 def prepared_localizer(kapture_map: KaptureMap, options: PipelineOptions) -> Localizer:

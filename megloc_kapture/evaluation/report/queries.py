@@ -26,7 +26,7 @@ NUM_SHOWN = 10
 # inlier threshold, as in pose estimation
 INLIER_PX = 12.0
 _NOTHING = np.zeros((0, 2)), np.zeros((0, 3))
-# from small to large errors; also distinct with a colour vision deficiency
+# from small to large errors; distinguishable with a colour vision deficiency
 _SCALE = ("#4cc3f0", "#7fd17f", "#f4d35e", "#ff9f45", "#ff4d4d")
 NO_POSE_COLOR, UNKNOWN_COLOR = "#9aa5b1", "#c9a7ff"
 # lower bounds of confidence for the first colours of _SCALE
