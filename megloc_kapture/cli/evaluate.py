@@ -145,7 +145,7 @@ class Submit(Common):
 
         place = self.output
         if place.is_dir() != folder and place.exists():
-            kind = "folder, one file per relocalization file" if folder else "file"
+            kind = "folder of one file per relocalization file" if folder else "file"
             raise OptionError(f"{place} exists and is not a {kind}")
         empty = folder and place.exists() and not any(place.iterdir())
         paths = [provenance_path(place)] if empty else [place, provenance_path(place)]

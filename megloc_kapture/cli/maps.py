@@ -163,8 +163,8 @@ class Densify(Reading, Choosing, Working):
 
 @dataclass(frozen=True, kw_only=True)
 class RefinePoses(Choosing, Working):
-    """Refine the poses of localized queries; a refined pose that is no better is rejected, with
-    the reason."""
+    """Refine the poses of localized queries; a refined pose that is no better is rejected, and
+    the reason recorded."""
 
     allow_links_below: AllowedLinks = ()
     input: Input

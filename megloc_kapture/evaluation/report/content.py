@@ -184,7 +184,7 @@ def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
     only_first, only_second = len(test.only_first), len(test.only_second)
     if not only_first and not only_second:
         if not test.both:
-            return f"{where} neither {first} nor {second} localizes a query."
+            return f"{where} neither {first} nor {second} localizes any query."
         return f"{where} {first} and {second} localize the same {_queries(test.both)}."
     return (
         f"{where} {first} localizes {_queries(only_first)} that {second} misses and {second} "
