@@ -249,7 +249,7 @@ def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
         second, third, fourth = (tensors[f"conv{level}.weight"].shape[1] for level in (2, 3, 4))
         positions = tensors["desc_head.agg_weights"].shape[0]
     except (KeyError, IndexError) as error:
-        raise DataError(f"this file is no ALIKED checkpoint: no {error}", path=where) from error
+        raise DataError(f"this file is not an ALIKED checkpoint: no {error}", path=where) from error
     net = AlikedNet((first, second, third, fourth), positions)
     return load_strictly(net, tensors, where).eval()
 

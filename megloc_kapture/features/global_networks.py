@@ -1,4 +1,4 @@
-"""Global features of networks: NetVLAD, OpenIBL, AP-GeM, DELG and MegaLoc.
+"""Global features from networks: NetVLAD, OpenIBL, AP-GeM, DELG and MegaLoc.
 
 Plugins of group ``megloc_kapture.global_features`` with the authors' weights: NetVLAD (Arandjelovic
 et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al., ICCV 2019), DELG
@@ -166,7 +166,7 @@ class ApGemOptions(NetworkOptions):
         default=0.25,
         ge=0,
         le=1,
-        description="components are divided by their variances to this power",
+        description="components are divided by their variances raised to this power",
     )
     max_size_px: int | None = Field(
         default=1024,

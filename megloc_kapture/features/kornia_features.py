@@ -1,4 +1,4 @@
-"""Local features by kornia: XFeat (Potje et al., CVPR 2024), DISK (Tyszkiewicz et al., 2020)."""
+"""Local features from kornia: XFeat (Potje et al., CVPR 2024), DISK (Tyszkiewicz et al., 2020)."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
 def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
     """Return the offset (x, y) from kornia's pixel coordinates to COLMAP's, in image pixels.
 
-    It is half a pixel of the image that kornia resizes for XFeat.
+    It is half a pixel of the image as resized by kornia for XFeat.
     """
     sides = np.array([shape[1], shape[0]], np.float32)
     resized = np.maximum(sides // _XFEAT_STRIDE_PX, 1) * _XFEAT_STRIDE_PX

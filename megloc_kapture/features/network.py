@@ -42,7 +42,7 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 
     @abstractmethod
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
-        """Extract from RGB images of equal size in one batch, as :meth:`extract` up to rounding."""
+        """Batch :meth:`extract` over RGB images of equal size; results are equal up to rounding."""
 
     def _best(
         self,

@@ -77,7 +77,7 @@ class R2D2(LocalNetwork[R2D2Options]):
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         options = self.options
-        # twice as fast on a CPU as channels first
+        # channels last is twice as fast on a CPU
         network, device = self.network(load_r2d2, channels_last=True)
         levels_of: list[list[Level]] = [[] for _ in images]
         with inference(device, options.half_precision):

@@ -32,7 +32,7 @@ _WHITENING_NUMBERS = 1 << 28
 _COLUMNS = 4096  # dimensions per block when whitening is learnt
 # variances below this share of the largest are float32 rounding
 _LEAST = 1e-9
-# whitening divides by the standard deviations to this power, as AP-GeM does; with 1, as in Jegou
+# whitening divides by standard deviations raised to this power, as AP-GeM does; with 1, as in Jegou
 # and Chum, all images of a small map are equally dissimilar
 WHITENING_POWER = 0.5
 # alpha of soft assignment, for unit-norm descriptors; 10 makes retrieval worse
@@ -83,9 +83,9 @@ class PcaWhitening:
 def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
     """Learn whitening from vectors float32 (N, D), which are overwritten.
 
-    Components are divided by their standard deviations to the ``power``; a power below one reduces
-    the noise of the last components if images are few (Revaud et al., ICCV 2019). ``dimensions`` is
-    limited by the rank of the centred vectors, which is less than N.
+    Components are divided by their standard deviations raised to ``power``; a power below one
+    reduces the noise of the last components if images are few (Revaud et al., ICCV 2019).
+    ``dimensions`` is limited by the rank of the centred vectors, which is less than N.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
@@ -104,7 +104,7 @@ def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> Pc
             "images, or no whitening"
         )
     variances, axes = variances[:kept], axes[:, :kept]
-    # combine the vectors to principal axes of unit length (D,), divided by the deviations' power
+    # combine the vectors into unit-length principal axes (D,), divided by deviation ** power
     rows = (axes / np.sqrt(count * variances) / variances ** (power / 2)).T
     projection = np.empty((kept, size), dtype=np.float32)
     for start in range(0, size, _COLUMNS):

@@ -35,8 +35,8 @@ MAX_DEPTH_JUMP = 0.1
 # noise of triangulated points, from keypoints and map poses: with the sensor's noise alone, half
 # the points would be rejected (docs/experiments/map-refinement.md)
 KEYPOINT_NOISE_PX = 2.0
-# a point may match any depth within this many pixels: allows for edges and for misregistration of
-# image and depth
+# a point may lie anywhere between the extreme depths within this many pixels: allows for edges and
+# for misregistration of image and depth
 _WINDOW_PX = 3
 _SAME_CENTRE_M = 1e-9  # smaller offsets are rounding of composed transforms
 
@@ -93,10 +93,10 @@ def lift_with_covariances(
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Lift keypoints with a depth map that has the image's centre; also return covariances.
 
-    ``sigma_m`` float32 (H, W) are the standard deviations of depth for a keypoint noise of a third
-    of a pixel, as pose refinement assumes for a map, 0 where unknown. Returns points (N, 3) in the
-    camera's frame, their covariances (N, 3, 3) for a keypoint noise of 1 px, and a validity mask
-    (N,).
+    ``sigma_m`` float32 (H, W) are the standard deviations of depth, 0 where unknown, for a keypoint
+    noise of a third of a pixel, which pose estimation assumes for a map. Returns points (N, 3) in
+    the camera's frame, their covariances (N, 3, 3) for a keypoint noise of 1 px, and a validity
+    mask (N,).
     """
     same = RigidTransform.identity()
     points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same)

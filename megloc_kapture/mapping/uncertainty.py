@@ -75,7 +75,7 @@ def _by_point(
     for name, ids, count in (("point", point_ids, num_points), ("image", image_ids, num_images)):
         if len(ids) and not (ids.min() >= 0 and ids.max() < count):
             raise DataError(
-                f"observations of {name} {ids.min()} to {ids.max()}, but there are {count}"
+                f"observations of {name}s {ids.min()} to {ids.max()}, but there are {count}"
             )
     if (point_ids[1:] < point_ids[:-1]).any():
         order = np.argsort(point_ids, kind="stable")

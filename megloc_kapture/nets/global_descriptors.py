@@ -34,7 +34,7 @@ STRIDE_PX = 16  # stride of the backbone, which is also the smallest image side
 _CONV5_3 = 28  # the last layer, without its ReLU: features have either sign
 _CHANNELS = 512
 _NUM_CLUSTERS, _OUTPUT_SIZE = 64, 4096
-# only checkpoints converted from NetVLAD's authors have this key
+# only checkpoints converted from those of NetVLAD's authors have this key
 _AVERAGE_IMAGE = "average_image"
 # OpenIBL's mean for colours in [0, 1], times 255
 _OPENIBL_MEAN_RGB = (123.68, 116.779, 103.939)
@@ -62,7 +62,7 @@ class NetVladLayer(nn.Module):
         self.centroids = nn.Parameter(torch.rand(num_clusters, size))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Aggregate non-zero features (B, D, h, w) to unit-norm vectors (B, K D)."""
+        """Aggregate non-zero features (B, D, h, w) into unit-norm vectors (B, K D)."""
         unit = functional.normalize(features, dim=1)
         weights = self.conv(unit).flatten(2).softmax(dim=1)
         # sum first, which avoids the (B, K, D, h w) array of residuals
@@ -213,7 +213,7 @@ def whitening_from(
 ) -> nn.Linear:
     """Build a PCA whitening, for vectors that are normalised afterwards.
 
-    Components are divided by the variances to a ``power``: 0.5 in scikit-learn, 0.25 in the
+    Components are divided by their variances raised to ``power``: 0.5 in scikit-learn, 0.25 in the
     authors' evaluation.
     """
     known = sorted({key.split(".")[1] for key in tensors if key.startswith("pca.")})

@@ -84,7 +84,7 @@ def load_lightglue(
 
     By default the network stops early (``depth_confidence``) and drops keypoints
     (``width_confidence``), as the authors' does. A value of -1 disables either; tensors that
-    only it needs may then be missing. Positional encoding and assignment are never in half
+    are then unneeded may be missing. Positional encoding and assignment are never in half
     precision.
     """
     tensors = {

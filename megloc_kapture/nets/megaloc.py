@@ -78,7 +78,7 @@ def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
 
 
 class Salad(nn.Module):
-    """SALAD: aggregates features of patches and of the image to one unit-norm vector.
+    """SALAD: aggregates features of patches and of the image into one unit-norm vector.
 
     The input has ``channels`` channels, the hidden layers have ``hidden``, and the output has
     ``token_size + cluster_size * clusters`` components.
@@ -102,7 +102,7 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.tensor(1.0))
 
     def forward(self, patches: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
-        """Aggregate features of patches (B, C, h, w) and image (B, C) to float32 (B, D)."""
+        """Aggregate features of patches (B, C, h, w) and image (B, C) into float32 (B, D)."""
         features = self.cluster_features(patches).flatten(2)
         # in half precision only two digits would be correct after the exponential
         shares = assignment(self.score(patches).flatten(2).float(), self.dust_bin)

@@ -276,7 +276,7 @@ class NerfW(nn.Module):
 
 
 class TriPlane(nn.Module):
-    """Three planes at three resolutions, and the embeddings of the images.
+    """Three planes at each of three resolutions, and the embeddings of the images.
 
     A point's features are products of three planes (K-Planes, Fridovich-Keil et al., CVPR 2023, eq.
     1); small networks turn them into density, colour and a transient part. Most samples lie around

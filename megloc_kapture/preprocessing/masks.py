@@ -187,9 +187,7 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     if (tops == height).all():
         return UnchangingRegion(nothing, "its images have no static region at the bottom")
     if 1 - tops.mean() / height > _MAX_AREA:
-        return UnchangingRegion(
-            nothing, "nearly the whole image is static, so the camera hardly moves"
-        )
+        return UnchangingRegion(nothing, "most of the image is static, so the camera hardly moves")
     tops = np.where(tops < height, np.maximum(tops - _MARGIN_PX, 0), tops)
     return UnchangingRegion(tuple(float(top) for top in tops / height))
 
