@@ -5,8 +5,8 @@ matches at other scales and rotations.
 
 Guided pyramids give a keypoints type ``T-pyramid`` with the matches of all pairs: the keypoints of
 type T, unchanged, followed by the added keypoints. Indices into T are therefore valid in T-pyramid.
-All variants of all pairs are matched before the matches of a pair are combined, so that the order
-of the added keypoints does not depend on the workers.
+All variants of all map pairs are matched before the matches of a pair are combined, so that the
+order of the added keypoints does not depend on the workers.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def retry_query(
     ----------
     matches : name, verified matches (K, 2) and scores (K,) of each candidate, best first.
     frame : reads pixels and mask of the query; called only if a candidate has few matches.
-    num_found : number of matches before verification by candidate.
+    num_found : by candidate, the number of matches before verification.
     """
     base = {other: pairs for other, pairs, _ in matches}
     is_hard = method.options.is_hard

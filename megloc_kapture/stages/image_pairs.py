@@ -1,6 +1,6 @@
 """Stages: image pairs to match, within the map and between queries and map.
 
-Pairs of similar images are retrieved by one or several global features.
+Pairs of similar images are retrieved with one or several global features.
 """
 
 from __future__ import annotations
@@ -176,8 +176,8 @@ def most_similar(
     Parameters
     ----------
     queries, database : unit vectors (Q, D) and (M, D) by type.
-    permitted : indices (M,) of the database's images; the result has these indices, or -1 for
-        missing images.
+    permitted : indices (M,) of the database's images; the result has these indices, or -1 where
+        images are too few.
     """
     index, scores = retrieval.rank(queries, database, top_k)
     return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
@@ -246,7 +246,7 @@ def pair_map_images(
         row_of = np.full(len(images), -1, dtype=np.int64)
         row_of[members] = np.arange(len(members))
         rows = row_of[image_ids]
-        seen = point_ids[rows >= 0], rows[rows >= 0]  # rows index ``images``
+        seen = point_ids[rows >= 0], rows[rows >= 0]  # rows index ``names``
         for method in options.by:
             similarity = None
             if method == "retrieval":

@@ -1,4 +1,4 @@
-"""Localized queries as kapture with tables, and queries whose images cannot be read."""
+"""Localized queries as a kapture folder with tables, and queries with unreadable images."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def write_localized(
     first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
     timing: Path | None = None,
 ) -> dict[str, int]:
-    """Write localized queries as kapture with tables of status, poses, clusters and covariances.
+    """Write a kapture of localized queries with tables of status, poses, clusters and covariances.
 
     A query with an estimated focal length gets a separate camera.
 

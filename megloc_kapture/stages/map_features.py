@@ -1,7 +1,7 @@
 """Features of map images: copies for new maps, and extracted features for models without them.
 
-A model without descriptors, for example of COLMAP, stores only keypoint positions. Its observations
-are transferred to extracted keypoints at the same positions.
+A model without descriptors, for example from COLMAP, stores only keypoint positions. Its
+observations are transferred to extracted keypoints at the same positions.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def move_points(
     require(
         num_found >= _MIN_FOUND_AGAIN * len(seen),
         f"the model has no descriptors, and extracting {local_type} again finds keypoints "
-        f"of only {num_found / len(seen):.0%} of its {len(seen)} observations: it "
+        f"for only {num_found / len(seen):.0%} of its {len(seen)} observations: it "
         "was made with another detector, other options or other images",
         path=model.root,
     )

@@ -291,7 +291,7 @@ def _votes_of_other_scans(
     options: DepthVerificationOptions,
     work: Work,
 ) -> tuple[NDArray[np.int64], Mask]:
-    """Return the sums of votes (L,) of nearby scans on lifted points, and those they could judge.
+    """Return the sums of votes (L,) of nearby scans on lifted points, and a mask of those judged.
 
     ``lifted`` (L,) are the rows of the points' observations.
 
@@ -329,7 +329,7 @@ def _judge(
     options: DepthVerificationOptions,
     job: tuple[list[str], Floats, Floats],
 ) -> tuple[Mask, Mask]:
-    """Return masks of the points (N, 3) that a scan's images see through, and find a surface at."""
+    """Return masks of points (N, 3): those that a scan's images see through, those on a surface."""
     images, xyz, sigmas = job
     through, agreeing = np.zeros((2, len(xyz)), dtype=bool)
     for image in images:
@@ -352,7 +352,7 @@ def _compare(
     options: DepthVerificationOptions,
     job: tuple[str, Floats, Floats],
 ) -> tuple[Mask, int]:
-    """Return a mask of the points that an image's depth contradicts; count those with depth."""
+    """Return a mask of points that an image's depth contradicts, and the number with depth."""
     image, xyz, covariances = job
     depth, cam_from_world = _depth_and_pose(folder, image)
     axis = (depth.image_from_depth.inverse() @ cam_from_world).rotation_matrix()[2]

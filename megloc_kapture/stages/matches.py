@@ -94,7 +94,7 @@ class SecondMatchingOptions(Options):
     min_matches: int | None = Field(
         default=None,
         gt=0,
-        description="match only pairs again that have verified matches, but fewer than this; "
+        description="match again only pairs that have verified matches, but fewer than this; "
         "none: all",
     )
     queries: bool = Field(
@@ -195,7 +195,7 @@ def pairs_to_rematch(
     """Return the pairs of the second matching, from the number of verified matches of all pairs.
 
     These are the ``pairs`` best of each first image; with ``min_matches``, the best of those with
-    fewer matches, but not without any: these are seldom pairs of overlapping images.
+    fewer matches but at least one, since images without matches seldom overlap.
     With ``of_both``, also those of each second image; a pair then counts for both of its images.
     Ties are broken by name, and the result is sorted by name.
     """
@@ -243,7 +243,7 @@ def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
 
     Among pairs of equal score, images with close positions in the sorted list count as more
     similar, as they are often consecutive. Each image of a group is also paired with the image most
-    similar to it, since the group may only look alike.
+    similar to it, since the group's images may merely look alike.
     """
     images = sorted({image for pair in pairs for image in (pair.query, pair.map)})
     position = {image: at for at, image in enumerate(images)}

@@ -89,7 +89,7 @@ def train_field_of_map(
     *,
     progress: Callable[[int, float, list[float]], None] | None = None,
 ) -> Mapping[str, float]:
-    """Train a field on the posed images of a map, or resume an interrupted training.
+    """Train a field on the posed images of a map, or resume an interrupted training run.
 
     Masks and depth are used where available. Return the PSNR in dB of each held-out image.
     """
@@ -221,7 +221,7 @@ def render_along(
     min_shown: float = 0.0,
     work: Work = HERE,
 ) -> int:
-    """Render the posed images of a kapture as one with depth; return the number of renderings.
+    """Render the posed images of a kapture to a new one with depth; return the number written.
 
     Parameters
     ----------

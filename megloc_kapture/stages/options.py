@@ -169,7 +169,7 @@ class PipelineOptions(Options):
         return matcher
 
     def make_second_matcher(self, *, of_queries: bool) -> Matcher | None:
-        """Create the matcher of the second pass of queries, or of map images; or None."""
+        """Create the second matcher of queries or of map images; None if there is none."""
         chosen = self.second_matching.matcher
         if chosen is None or (of_queries and not self.second_matching.queries):
             return None

@@ -1,4 +1,4 @@
-"""Files of depth by multi-view stereo in a map, and the point cloud fused from them.
+"""Files of multi-view stereo depth in a map, and the point cloud fused from them.
 
 Depth maps are kapture depth records of a sensor ``CAMERA_mvs`` with the camera's pose, float32, 0 =
 unknown. Files outside the kapture format are ``sensors/mvs/IMAGE.sigma.npy`` (float32, standard

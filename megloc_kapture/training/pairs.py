@@ -37,7 +37,7 @@ from megloc_kapture.training.labels import (
 # candidate pairs, before their overlap is measured
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
 _VIEWS_KEPT = 64
-# bounds of the overlap bins, from which pairs are drawn with equal probability
+# bounds of the overlap bins; each bin is drawn with equal probability
 _OVERLAP_BINS = (0.1, 0.3, 0.5, 0.7)
 # views of a photograph: smallest size relative to the largest that fits, largest rotation, and
 # largest displacement of the corners as a share of the view's sides

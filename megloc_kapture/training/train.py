@@ -84,7 +84,7 @@ class TrainingOptions(NetworkOptions):
     )
     matcher_weights: str | None = Field(
         default=None,
-        description="initial SuperGlue; none: a new network that starts as nearest neighbours",
+        description="initial SuperGlue; none: a new network, at first a nearest-neighbour matcher",
     )
     check_every: int = Field(
         default=1000, gt=0, description="steps between evaluations and checkpoints"
@@ -130,7 +130,7 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
 
 
 class Trainer:
-    """A seeded training; ``rows`` are the curves up to ``step`` with COLUMNS, NaN if unknown."""
+    """A seeded training run; ``rows`` are its curves up to ``step``: COLUMNS, NaN if unknown."""
 
     def __init__(self, options: TrainingOptions) -> None:
         self.options = options
@@ -256,7 +256,7 @@ def train(
     ----------
     kaptures, held_out : with poses and depth; ``held_out`` for evaluation only.
     photographs : folders of images, for homographies.
-    force : replace another training's files.
+    force : replace another training run's files.
     threads : number of threads that prepare pairs.
     """
     if output.suffix != ".safetensors":
@@ -308,7 +308,7 @@ def _check_data(
 
 
 def _check_same_training(output: Path, record: Mapping[str, Any]) -> None:
-    """Raise OutputError unless the existing files are from the same training."""
+    """Raise OutputError unless the existing files are from the same training run."""
     manifest = output.with_suffix(".json")
     try:
         known = json.loads(read_content(manifest)).get("training")
