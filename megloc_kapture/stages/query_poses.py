@@ -286,9 +286,9 @@ def localize_from_matches(
 ) -> Iterator[Pose | Failure]:
     """Localize every query from stored matches of ``local_types``; yield results sorted by name.
 
-    ``query`` has the keypoints and the matches. Cameras of a rig that are localized jointly stay
-    together. A map may have the base type instead of a guided pyramid type. ``scratch`` is a folder
-    for a temporary map index.
+    ``query`` has the keypoints and the matches. Jointly localized cameras of a rig stay together,
+    sorted by the first. A map may have the base type instead of a guided pyramid type. ``scratch``
+    is a folder for a temporary map index.
     """
     ranker = options.make_ranker(work.placement)
     candidates = candidates_of(pairs)

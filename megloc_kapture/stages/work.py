@@ -130,7 +130,7 @@ def ordered_map(
     *,
     window: int = 32,
 ) -> Iterator[Result]:
-    """Map on an executor, in order, with at most ``window`` items in flight."""
+    """Map on an executor, in order, with at most ``window`` items in flight (Dask: maybe more)."""
     if executor is None:
         yield from map(function, items)
         return
