@@ -222,7 +222,6 @@ def _map_frame(
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
     return Frame(
         name=names[0],
-        role="mapping",
         condition="day",
         place=place.index,
         timestamp=0,  # nothing was taken at the same time

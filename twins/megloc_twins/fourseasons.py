@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,6 @@ from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.frames import (
     Frame,
     Lighting,
-    Role,
     day_lighting,
     in_frame,
     looking_at,
@@ -62,8 +60,7 @@ _FRAMES_PER_KEYFRAME = 3  # the keyframe and the frames after it
 _EXTRA_EVERY = 8  # after every 8th keyframe, the next frame also has images
 _MARGIN_M = 0.35
 
-Season = Literal["summer", "winter", "dusk"]
-_SUN = {"summer": (45.0, 60.0), "winter": (20.0, 30.0), "dusk": (0.0, 5.0)}  # elevation, degrees
+_SUN = {REFERENCE: (45.0, 60.0), WINTER: (20.0, 30.0), DUSK: (0.0, 5.0)}  # elevation, degrees
 _DUSK_SKY = (0.014, 0.03)
 _DUSK_EXPOSURE = 0.65
 
@@ -98,12 +95,10 @@ class Moment:
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording: route, time and appearance."""
+    """A recording along the route."""
 
-    name: str  # contains the time
-    season: Season  # determines light and ground
+    name: str  # contains the time, determines light and ground
     keyframes_per_place: int  # at equal distances along a place's path
-    role: Role  # of its images
     lateral_m: float  # largest lateral deviation from the path
     turn_deg: float  # largest deviation from the path's direction
 
@@ -127,9 +122,9 @@ class FourSeasonsTwinOptions(TwinOptions):
 
     def drives(self) -> tuple[Drive, Drive, Drive]:
         return (
-            Drive(REFERENCE, "summer", self.map_keyframes, "mapping", 0.1, 2),
-            Drive(WINTER, "winter", self.winter_keyframes, "query", 0.6, 8),
-            Drive(DUSK, "dusk", self.dusk_keyframes, "query", 0.9, 12),
+            Drive(REFERENCE, self.map_keyframes, 0.1, 2),
+            Drive(WINTER, self.winter_keyframes, 0.6, 8),
+            Drive(DUSK, self.dusk_keyframes, 0.9, 12),
         )
 
 
@@ -150,7 +145,7 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
         _write_calibration(root / "calibration", stereo_camera(options.width, options.height))
         for drive in drives:
             _write_recording(root, options, drive, driven[drive.name], work)
-            if drive.role == "query":
+            if drive.name != REFERENCE:
                 write_lines(
                     root / f"relocalizationFile_{REFERENCE}_to_{drive.name}.txt",
                     _relocalization_lines(keyframes[REFERENCE], keyframes[drive.name]),
@@ -176,8 +171,8 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
     clock = int(start.timestamp()) * 10**9
     for index in range(options.num_places):
         place = build_place(options, index)
-        sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[drive.season])))
-        phase = rng.uniform(0.25, 0.75) if drive.role == "query" else 0.5
+        sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[drive.name])))
+        phase = 0.5 if drive.name == REFERENCE else rng.uniform(0.25, 0.75)
         for stop in range(drive.keyframes_per_place):
             along = (stop + phase) / drive.keyframes_per_place * place.plan.path_length_m
             lateral = _free_offset(place.plan, along, drive.lateral_m, rng)
@@ -212,14 +207,14 @@ def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
     return replace(place, recipes=tuple(recipes))
 
 
-def _lighting(season: Season, rng: np.random.Generator, sun: tuple[float, float]) -> Lighting:
-    if season == "dusk":
+def _lighting(recording: str, rng: np.random.Generator, sun: tuple[float, float]) -> Lighting:
+    if recording == DUSK:
         night = night_lighting(rng, exposure=_DUSK_EXPOSURE)
         # the lamps are on, and the sky is still slightly bright
         light = float(rng.uniform(*_DUSK_SKY))
         sky = (0.85 * light, 0.95 * light, 1.25 * light)
         return replace(night, sky=sky, sky_colour=sky)
-    overcast = 0.15 if season == "summer" else float(rng.choice([0.3, 0.7, 1.0]))
+    overcast = 0.15 if recording == REFERENCE else float(rng.choice([0.3, 0.7, 1.0]))
     return day_lighting(rng, sun, overcast=overcast)
 
 
@@ -234,7 +229,7 @@ def _frames(
     rng: np.random.Generator,
 ) -> tuple[Frame, ...]:
     moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
-    lighting = _lighting(drive.season, rng, sun)
+    lighting = _lighting(drive.name, rng, sun)
     poses = {"cam0": cam0_from_world, "cam1": CAM1_FROM_CAM0 @ cam0_from_world}
     frames = []
     for sensor_id, pose in poses.items():
@@ -242,7 +237,6 @@ def _frames(
         frames.append(
             Frame(
                 name=name,
-                role=drive.role,
                 condition=drive.name,
                 place=place.index,
                 timestamp=timestamp,
@@ -285,9 +279,9 @@ def _write_recording(
         options.world(),
         [frame for moment in moments for frame in moment.frames],
         partial(_write_grey, root),
-        build=winter_place if drive.season == "winter" else build_place,
+        build=winter_place if drive.name == WINTER else build_place,
         # with the same dirt as in the map, the bonnet would yield the best matches of queries
-        sky_seed=options.seed + (list(_SUN).index(drive.season) << 32),
+        sky_seed=options.seed + (list(_SUN).index(drive.name) << 32),
         work=work,
     )
     times = (moment.timestamp for moment in moments)  # most have no images

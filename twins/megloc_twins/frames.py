@@ -19,7 +19,6 @@ from megloc_twins.portable import exp, product, settled, settled_pose
 
 Triple = tuple[float, float, float]
 Condition = Literal["day", "night"]
-Role = Literal["mapping", "query"]
 
 _DARK: Triple = (0.0, 0.0, 0.0)
 _UP: Triple = (0.0, 0.0, 1.0)
@@ -204,7 +203,6 @@ class Frame:
     """An image of the world before rendering."""
 
     name: str  # path below ``records_data``
-    role: Role
     condition: str  # day, night or a condition of the dataset, for reports
     place: int  # index of the visible place
     timestamp: int  # equal for the frames of one stop of a rig

@@ -131,7 +131,6 @@ def _cutouts(
         frames.append(
             Frame(
                 name=name,
-                role="mapping",
                 condition=_FLOORS[floor],
                 place=floor,
                 timestamp=len(frames) + 1000 * number + 1_000_000 * floor,
@@ -166,7 +165,7 @@ def _write_transformation(path: Path, before: RigidTransform, after: RigidTransf
 def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: RenderedFrame) -> None:
     """Write a frame's image and, for a cutout, the scanned points of its pixels."""
     write_image(root / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
-    if frame.role == "query":
+    if frame.sensor_id != "cutout":
         return
     floor = build_floor(options.seed, frame.place, options.modules)
     yaw, pitch = (int(text) for text in PurePosixPath(frame.name).stem.split("_")[-2:])
@@ -251,7 +250,6 @@ def build_queries(options: InLocTwinOptions) -> list[Frame]:
             frames.append(
                 Frame(
                     name=name,
-                    role="query",
                     condition=_FLOORS[index],
                     place=index,
                     timestamp=len(frames),

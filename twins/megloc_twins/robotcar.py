@@ -216,7 +216,6 @@ def _moment(
         frames.append(
             Frame(
                 name=name,
-                role="mapping" if condition == REFERENCE_CONDITION else "query",
                 condition=condition,
                 place=place.index,
                 timestamp=timestamp,

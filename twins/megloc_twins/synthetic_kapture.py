@@ -81,7 +81,6 @@ def _mapping_frames(
             frames.append(
                 Frame(
                     name=image,
-                    role="mapping",
                     condition="day",
                     place=place.index,
                     timestamp=timestamp,
@@ -206,7 +205,7 @@ def write_files(
     root: Path, options: SyntheticWorldOptions, frame: Frame, view: RenderedFrame
 ) -> None:
     """Write an image, and its depth and mask if present."""
-    sensors = root / frame.role / "sensors"
+    sensors = root / ("query" if frame.name.startswith("query/") else "mapping") / "sensors"
     records = sensors / "records_data"
     write_image(records / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
     if view.depth_m is not None:

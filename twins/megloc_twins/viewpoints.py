@@ -157,7 +157,6 @@ def query_frames(
         frames.append(
             Frame(
                 name=image,
-                role="query",
                 condition=condition,
                 place=place.index,
                 timestamp=(100_000 if condition == "day" else 200_000) + number,

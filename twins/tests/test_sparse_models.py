@@ -96,7 +96,7 @@ def frame(name: str, x: float, *, camera: Camera, yaw_deg: float = 90.0) -> Fram
     """A camera at (x, 0, 0) that looks along +y unless turned."""
     lighting = day_lighting(rng(), (0.0, 1.0), overcast=0.0)
     pose = looking_at(np.array([x, 0.0, 0.0]), np.radians(yaw_deg), 0.0, 0.0)
-    return Frame(name, "mapping", "day", 0, 0, name, camera, pose, lighting, 0)
+    return Frame(name, "day", 0, 0, name, camera, pose, lighting, 0)
 
 
 PINHOLE = Camera("PINHOLE", 40, 30, (40.0, 40.0, 20.0, 15.0))
