@@ -101,12 +101,7 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
             [replace(frame, timestamp=time) for time, frame in enumerate(some)]
             for some in (mapping, queries)
         )
-        write_truth(root, *timed)
-        return {
-            "places": options.num_places,
-            "mapping images": len(mapping),
-            "query images": len(queries),
-        }
+        return {"places": options.num_places} | write_truth(root, *timed)
 
 
 @dataclass(frozen=True, eq=False)

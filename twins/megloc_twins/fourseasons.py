@@ -150,17 +150,11 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
                     root / f"relocalizationFile_{REFERENCE}_to_{drive.name}.txt",
                     _relocalization_lines(keyframes[REFERENCE], keyframes[drive.name]),
                 )
-        asked = [*keyframes[WINTER], *keyframes[DUSK]]
         truth = (
             in_frame([frame for moment in moments for frame in moment.frames], EARTH_FROM_WORLD)
-            for moments in (keyframes[REFERENCE], asked)
+            for moments in (keyframes[REFERENCE], keyframes[WINTER] + keyframes[DUSK])
         )
-        write_truth(root, *truth)
-        return {
-            "places": options.num_places,
-            "mapping images": 2 * len(keyframes[REFERENCE]),
-            "query images": 2 * len(asked),
-        }
+        return {"places": options.num_places} | write_truth(root, *truth)
 
 
 def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:

@@ -247,9 +247,12 @@ def write_truth(
     queries: Iterable[Frame],
     *,
     rigs: Mapping[str, dict[str, RigidTransform]] | None = None,
-) -> None:
-    """Write the true poses of all images as kapture below ``root``."""
+) -> dict[str, int]:
+    """Write the true poses of all images as kapture below ``root``; return the image counts."""
+    counts = {}
     for role, frames in (("mapping", mapping), ("query", queries)):
         data = kapture_records(frames)
         data.rigs.update(rigs or {})
         write_sensors(root / GROUND_TRUTH / role, data)
+        counts[f"{role} images"] = len(data.records_camera)
+    return counts

@@ -101,15 +101,10 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
                 build=partial(floor_place, options.modules),
                 work=work,
             )
-        write_truth(root, mapping, queries)
         groups = {frame.name: ImageGroup(condition=frame.condition) for frame in queries}
         write_groups(root / GROUND_TRUTH / SIDE_TABLES, groups)
-        return {
-            "floors": len(_FLOORS),
-            "scans": len(mapping) // (len(YAWS_DEG) * len(PITCHES_DEG)),
-            "mapping images": len(mapping),
-            "query images": len(queries),
-        }
+        scans = len(mapping) // (len(YAWS_DEG) * len(PITCHES_DEG))
+        return {"floors": len(_FLOORS), "scans": scans} | write_truth(root, mapping, queries)
 
 
 def _transformation(floor: int, number: int) -> str:

@@ -7,7 +7,7 @@ converted to the published one when written.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -116,37 +116,29 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         layout, options = Layout(Path(root)), self.options
-        frames = build_robotcar_frames(options)
-        depths_m = render_map_and_queries(
-            options, frames.mapping, frames.queries, layout.images, work
-        )
-        registered = in_frame(_registered(frames.mapping), OFFICIAL_FROM_WORLD)
-        queries = in_frame(frames.queries, OFFICIAL_FROM_WORLD)
+        mapping, queries = build_robotcar_frames(options)
+        depths_m = render_map_and_queries(options, mapping, queries, layout.images, work)
+        last = {frame.place: frame.timestamp for frame in mapping}
+        # all but one reference image per location are in the models
+        registered = [
+            frame
+            for frame in in_frame(mapping, OFFICIAL_FROM_WORLD)
+            if (frame.sensor_id, frame.timestamp) != ("right", last[frame.place])
+        ]
+        queries = in_frame(queries, OFFICIAL_FROM_WORLD)
         _write_models(layout, options, registered, depths_m)
         _write_car(layout, options)
         _write_query_lists(layout, queries)
         _write_version_2(layout, options, queries)
-        write_truth(layout.root, registered, queries, rigs={RIG_ID: CAM_FROM_CAR})
-        return {
-            "places": options.num_locations,
-            "mapping images": len(registered),
-            "query images": len(queries),
-        }
+        counts = write_truth(layout.root, registered, queries, rigs={RIG_ID: CAM_FROM_CAR})
+        return {"places": options.num_locations} | counts
 
 
-@dataclass(frozen=True, eq=False)
-class RobotCarFrames:
-    """All images of the twin, three per moment, with poses in the world.
+def build_robotcar_frames(options: RobotCarTwinOptions) -> tuple[list[Frame], list[Frame]]:
+    """Choose the map images and queries, three per moment, with poses in the world.
 
-    ``mapping`` is sorted by location, then time, ``queries`` by condition, then time.
+    Map images are sorted by location, then time, queries by condition, then time.
     """
-
-    mapping: tuple[Frame, ...]
-    queries: tuple[Frame, ...]
-
-
-def build_robotcar_frames(options: RobotCarTwinOptions) -> RobotCarFrames:
-    """Choose all images of the twin, deterministically."""
     mapping: list[Frame] = []
     queries: list[Frame] = []
     for index in range(options.num_locations):
@@ -157,7 +149,7 @@ def build_robotcar_frames(options: RobotCarTwinOptions) -> RobotCarFrames:
             queries += _query_frames(options, place, views, condition)
         mapping += here
     queries.sort(key=lambda frame: (frame.condition, frame.timestamp))
-    return RobotCarFrames(tuple(mapping), tuple(queries))
+    return mapping, queries
 
 
 def car_cameras(size_px: int) -> dict[str, Camera]:
@@ -260,16 +252,6 @@ def _car_from_place(
     return looking_at(np.array([*spot, height]), float(yaw), pitch, roll)
 
 
-def _registered(frames: Sequence[Frame]) -> list[Frame]:
-    """Return the reference images in the models, all but one per location."""
-    last = {frame.place: frame.timestamp for frame in frames}
-    return [
-        frame
-        for frame in frames
-        if (frame.sensor_id, frame.timestamp) != ("right", last[frame.place])
-    ]
-
-
 def _write_models(
     layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], depths_m: Depths
 ) -> None:
@@ -282,7 +264,7 @@ def _write_models(
         rng = stream(options.seed, "robotcar", "points", place)
         points = exact_tracks(here, depths_m, rng)
         model = _colmap_model(here, points)
-        write_colmap_model(layout.individual_model(_location(place)), model, text=True)
+        write_colmap_model(layout.individual_model(f"{place + 1:03d}"), model, text=True)
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))
     names = [f"./{_png(frame.name)}" for frame in frames]
@@ -320,7 +302,7 @@ def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
     """Write the queries of all cameras, with the various line breaks of the published files."""
     for place in sorted({frame.place for frame in queries}):
         names = [frame.name for frame in queries if frame.place == place]
-        path = layout.query_list(_location(place))
+        path = layout.query_list(f"{place + 1:03d}")
         if place % 3 == 0:
             write_lines(path, [*names, ""])
         elif place % 3 == 1:
@@ -349,10 +331,6 @@ def _write_version_2(
     write_lines(layout.train_list, rows)
     names = [f"{frame.sensor_id}/{frame.timestamp}.png" for frame in test]
     write_lines(layout.test_list, shuffled(names, options.seed, "robotcar", "order", "test"))
-
-
-def _location(place: int) -> str:
-    return f"{place + 1:03d}"
 
 
 def _png(name: str) -> str:

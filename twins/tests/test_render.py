@@ -104,7 +104,8 @@ SEED = CAR.world().seed
 
 @pytest.fixture(scope="module")
 def car_frames() -> list[Frame]:
-    return list(build_robotcar_frames(CAR).queries)
+    _, queries = build_robotcar_frames(CAR)
+    return queries
 
 
 @pytest.fixture(scope="module")
