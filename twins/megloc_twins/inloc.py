@@ -238,8 +238,7 @@ def build_queries(options: InLocTwinOptions) -> list[Frame]:
             rng = stream(options.seed, "indoor", "query", index, position)
             upright = (position + position // len(floor.zones)) % 3 == 2
             camera = phone_camera(*(size[::-1] if upright else size))
-            poses = _query_poses(floors, index, zone, camera, scans, rng)
-            pose, yaw = first_fitting(poses, zone.name)
+            pose, yaw = first_fitting(_query_poses(floors, index, zone, camera, scans, rng))
             name = f"query/iphone7/IMG_{_FIRST_QUERY + len(frames):04d}.JPG"
             light = stream(options.seed, "inloc", "light", name)
             frames.append(

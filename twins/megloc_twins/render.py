@@ -71,6 +71,7 @@ class ShadowMap:
         return (up + np.float32(_BIAS_M) > top).astype(np.float32)
 
 
+@lru_cache(maxsize=1)  # consecutive frames of a place often have the same sun
 def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
     """Return the shadow map of surfaces, whose fronts and backs cast shadows."""
     sun = np.array(sun_direction)
@@ -129,7 +130,10 @@ def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDAr
         lit = lit + np.float32(0.04) * _rgb(lighting.lamps)
         light = light * (1 - cover[..., None]) + paint * cover[..., None] * lit
     signal = light * (_rgb(lighting.white_balance) * np.float32(lighting.exposure))
-    signal *= (1 - np.float32(lighting.vignetting) * _corner_distance(width, height))[..., None]
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
+    squared_radius = (x[None] ** 2 + y[:, None] ** 2) / 2  # 1 in the corners
+    signal *= (1 - np.float32(lighting.vignetting) * squared_radius)[..., None]
     if lighting.condition == "night":  # stray light around lamps
         haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
         signal = signal + np.float32(0.06) * haze
@@ -141,14 +145,6 @@ def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDAr
     signal = np.clip(signal, 0, None)
     signal = np.where(signal > 0.7, 1 - 0.3 * exp(-(signal - 0.7) / 0.3), signal)
     return np.clip(np.sqrt(signal) * 255 + 0.5, 0, 255).astype(np.uint8)
-
-
-@lru_cache(maxsize=8)
-def _corner_distance(width: int, height: int) -> Float32:
-    """Return squared distances from the image centre, 1 in the corners, float32 (height, width)."""
-    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
-    y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
-    return ((x[None] ** 2 + y[:, None] ** 2) / 2).astype(np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -177,8 +173,6 @@ def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
     emblem = (width // 2, int(0.9 * height))
     cv2.circle(canvas, emblem, height // 48, (0.7, 0.7, 0.7), -1, cv2.LINE_AA)
     cv2.circle(canvas, emblem, height // 80, (0.1, 0.1, 0.3), -1, cv2.LINE_AA)
-    cover.setflags(write=False)
-    canvas.setflags(write=False)
     return cover, canvas
 
 
@@ -213,7 +207,6 @@ class PlaceRenderer:
         noise = periodic_noise(stream(seed, "clouds"), _CLOUD_SIZE, cell=160, octaves=5)
         # share of light from clouds, seamless from left to right
         self._clouds = np.clip(0.5 + 0.5 * noise, 0, 1).astype(np.float32)
-        self._shadows: tuple[Triple, ShadowMap] | None = None
 
     def render(self, frame: Frame, *, depth: bool = False) -> RenderedFrame:
         """Render one frame, with its depth if requested."""
@@ -225,9 +218,8 @@ class PlaceRenderer:
         )
         shadows = None
         if any(frame.lighting.sun):
-            shadows = add_shadows(
-                self._static_shadows(frame.lighting.sun_direction), moving_objects
-            )
+            shadows = cast_shadows(self._place.surfaces, frame.lighting.sun_direction)
+            shadows = add_shadows(shadows, moving_objects)
         light = self._radiance(seen, surfaces, frame.lighting, cam_from_place, shadows)
         image = develop(light, frame, self._supersampling, self._seed)
         width, height = frame.camera.width, frame.camera.height
@@ -241,12 +233,6 @@ class PlaceRenderer:
             depth_m = depth_map(seen)
             depth_m[~mask] = 0
         return RenderedFrame(image, depth_m, mask)
-
-    def _static_shadows(self, sun: Triple) -> ShadowMap:
-        # consecutive frames often have the same sun
-        if self._shadows is None or self._shadows[0] != sun:
-            self._shadows = (sun, cast_shadows(self._place.surfaces, sun))
-        return self._shadows[1]
 
     def _radiance(
         self,

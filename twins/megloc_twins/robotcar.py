@@ -180,7 +180,7 @@ def _query_frames(
     frames = []
     for number in range(place.index, options.moments_per_condition, options.num_locations):
         rng = stream(options.seed, "robotcar", condition, place.index, number)
-        pose = first_fitting(_query_poses(options, place, map_views, rng), place.name)
+        pose = first_fitting(_query_poses(options, place, map_views, rng))
         frames += _moment(options, place, condition, number, pose, azimuth, rng)
     return frames
 

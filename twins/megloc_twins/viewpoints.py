@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
@@ -13,7 +14,6 @@ from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.frames import (
     Condition,
     Frame,
-    Lighting,
     day_lighting,
     looking_at,
     night_lighting,
@@ -46,13 +46,12 @@ Floats = NDArray[np.float64]
 class CoarseView:
     """A view's depth at reduced resolution, and points on a sparse grid of it.
 
-    ``small`` is the camera at that resolution; ``depth`` is float32 (h, w), metres, 0 without a
-    surface; ``points`` and ``normals``, float64 (P, 3), are visible points in the surfaces' frame,
+    ``camera`` has that resolution; ``depth`` is float32 (h, w), metres, 0 without a surface;
+    ``points`` and ``normals``, float64 (P, 3), are visible points in the surfaces' frame,
     ``surface`` (P,) the surfaces' indices.
     """
 
     camera: Camera
-    small: Camera
     cam_from_world: RigidTransform
     depth: NDArray[np.float32]
     points: Floats
@@ -68,11 +67,7 @@ def coarse_view(
     reduction: int = 8,
     stride: int = 4,
 ) -> CoarseView:
-    """Return a coarse view of surfaces.
-
-    ``depth`` is smaller than the image by ``reduction`` per axis; points are from every
-    ``stride``-th row and column of it.
-    """
+    """Return a reduced view, with points from every ``stride``-th row and column of it."""
     grid = sample_grid(reduced(camera, reduction), 1)
     seen = visible_surfaces(surfaces, cam_from_world, grid)
     depth = depth_map(seen)
@@ -81,7 +76,7 @@ def coarse_view(
     points = cam_from_world.inverse().apply((grid.rays()[sparse] * z[..., None])[z > 0])
     surface = seen.surface[sparse][z > 0]
     normals = surfaces.normals()[surface]
-    return CoarseView(camera, grid.camera, cam_from_world, depth, points, normals, surface)
+    return CoarseView(grid.camera, cam_from_world, depth, points, normals, surface)
 
 
 def visible(points: Floats, view: CoarseView) -> Bools:
@@ -89,7 +84,7 @@ def visible(points: Floats, view: CoarseView) -> Bools:
     in_camera = view.cam_from_world.apply(points)
     z = in_camera[:, 2]
     ahead = np.where((z > 0.1)[:, None], in_camera, [0.0, 0.0, 1.0])
-    column, row = np.floor(project(view.small, ahead)).astype(np.int64).T
+    column, row = np.floor(project(view.camera, ahead)).astype(np.int64).T
     height, width = view.depth.shape
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     inside &= z > 0.1
@@ -151,9 +146,13 @@ def query_frames(
         image = f"query/{condition}/{number:05d}.jpg"
         rng = stream(options.seed, "query", sensor_id)
         camera = query_camera(options, rng)
-        position, yaw, cam_from_place = first_fitting(
-            _query_poses(place, camera, map_views, rng), place.name
-        )
+        poses = _query_poses(place, camera, map_views, rng)
+        position, yaw, cam_from_place = first_fitting(poses)
+        if condition == "night":
+            lighting = night_lighting(rng)
+        else:
+            sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(35, 60)))
+            lighting = day_lighting(rng, sun, overcast=float(rng.choice([0.1, 0.5, 1.0])))
         frames.append(
             Frame(
                 name=image,
@@ -163,7 +162,7 @@ def query_frames(
                 sensor_id=sensor_id,
                 camera=camera,
                 cam_from_world=cam_from_place @ place.place_from_world,
-                lighting=_query_lighting(condition, rng),
+                lighting=lighting,
                 noise_seed=noise_seed(options.seed, image),
                 moving_objects=place_moving_objects(
                     place.plan, rng, options.moving_objects, position, yaw
@@ -186,13 +185,6 @@ def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Ca
     focal = rng.uniform(0.7, 0.95) * width
     cx, cy = width / 2 + rng.normal(0, 2), height / 2 + rng.normal(0, 2)
     return Camera("SIMPLE_RADIAL", width, height, (focal, cx, cy, rng.uniform(-0.09, 0.04)))
-
-
-def _query_lighting(condition: Condition, rng: np.random.Generator) -> Lighting:
-    if condition == "night":
-        return night_lighting(rng)
-    sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(35, 60)))
-    return day_lighting(rng, sun, overcast=float(rng.choice([0.1, 0.5, 1.0])))
 
 
 def _query_poses(
@@ -227,17 +219,14 @@ def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: fl
     return max(_MIN_SUPPORT - support(view, seen), max(shares) - _MAX_OVERLAP, 0.0)
 
 
-def first_fitting(candidates: Iterable[tuple[float, Item]], place: str) -> Item:
+def first_fitting(candidates: Iterable[tuple[float, Item]]) -> Item:
     """Return the first candidate of (misfit, candidate) with misfit 0, else that with the least.
 
     Candidates after it are not drawn.
     """
-    best: tuple[float, Item] | None = None
-    for candidate in candidates:
-        if best is None or candidate[0] < best[0]:
-            best = candidate
-        if candidate[0] == 0.0:
+    drawn = []
+    for misfit_and_candidate in candidates:
+        drawn.append(misfit_and_candidate)
+        if misfit_and_candidate[0] == 0.0:
             break
-    if best is None:  # every floor plan has room
-        raise RuntimeError(f"no free view in {place}")
-    return best[1]
+    return min(drawn, key=itemgetter(0))[1]
