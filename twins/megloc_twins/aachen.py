@@ -94,7 +94,10 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
         depths_m = render_map_and_queries(options, frames.mapping(), others, images, work)
         _write_nvm_model(models, options, database, depths_m)
         _write_colmap_model(models / "aachen_v_1_1", options, mapping, depths_m)
-        _write_lists(root / "queries", frames)
+        for when, listed in (("day", frames.day), ("night", frames.night)):
+            cameras = {frame.name: frame.camera for frame in listed}
+            path = root / f"queries/{when}_time_queries_with_intrinsics.txt"
+            _write_cameras(path, cameras, last_line_ends=False)
         queries = in_frame(frames.queries(), OFFICIAL_FROM_WORLD)
         # nothing was taken at the same time
         timed = (
@@ -124,7 +127,10 @@ class AachenFrames:
 def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
     """Choose all images of the twin, deterministically."""
     world = options.world()
-    numbers = _database_numbers(options)
+    # numbers of the database images, unordered and with gaps
+    count = options.num_places * options.stations_per_place * len(_YAWS_DEG)
+    numbers = stream(options.seed, "aachen", "numbers").permutation(2 * count + 50) + 1
+    numbers = numbers[numbers != _WRONG_IMAGE][:count]
     database: list[Frame] = []
     sequences: list[Frame] = []
     day: list[Frame] = []
@@ -151,13 +157,6 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
         + ordered(night[options.night_queries :], "additional"),
         unlisted=tuple(day[num_day:]),
     )
-
-
-def _database_numbers(options: AachenTwinOptions) -> NDArray[np.int64]:
-    """Draw numbers of the database images, unordered and with gaps."""
-    count = options.num_places * options.stations_per_place * len(_YAWS_DEG)
-    drawn = stream(options.seed, "aachen", "numbers").permutation(2 * count + 50) + 1
-    return drawn[drawn != _WRONG_IMAGE][:count]
 
 
 def _photographs(
@@ -298,13 +297,6 @@ def _write_colmap_model(
         points=exact_tracks(frames, depths_m, rng),
     )
     write_colmap_model(folder, model, text=False)
-
-
-def _write_lists(folder: Path, frames: AachenFrames) -> None:
-    for when, some in (("day", frames.day), ("night", frames.night)):
-        cameras = {frame.name: frame.camera for frame in some}
-        path = folder / f"{when}_time_queries_with_intrinsics.txt"
-        _write_cameras(path, cameras, last_line_ends=False)
 
 
 def _write_cameras(path: Path, cameras: Mapping[str, Camera], *, last_line_ends: bool) -> None:

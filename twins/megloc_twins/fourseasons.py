@@ -378,13 +378,11 @@ def _random_transform(
     rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
 ) -> RigidTransform:
     """Draw a translation, and a rotation by ``yaw`` about z and ``tilt`` about x and y at most."""
-    ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
-    cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
-    sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()
-    still = (0.0, 0.0, 0.0)
-    about_z = RigidTransform((cos_z, 0.0, 0.0, sin_z), still)
-    about_y = RigidTransform((cos_y, 0.0, sin_y, 0.0), still)
-    about_x = RigidTransform((cos_x, sin_x, 0.0, 0.0), still)
+    half = rng.uniform(-1, 1, 3) * (tilt, tilt, yaw) / 2
+    cos, sin = settled(np.cos(half)).tolist(), np.diag(settled(np.sin(half))).tolist()
+    about_x, about_y, about_z = (
+        RigidTransform((w, x, y, z), (0.0, 0.0, 0.0)) for w, (x, y, z) in zip(cos, sin, strict=True)
+    )
     x, y, z = (float(v) for v in rng.uniform(-1, 1, 3) * reach_m)
     shift = RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z))
     return shift @ about_z @ about_y @ about_x

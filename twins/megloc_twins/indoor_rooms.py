@@ -329,6 +329,7 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
     placed: list[tuple[Parts, RigidTransform]] = []
     rooms: list[Zone] = []
     corridor: list[Zone] = []
+    along, aside = 0.5 * (MODULE_M - ROOM_M[0]), 0.5 * CORRIDOR_M + WALL_THICKNESS_M
     for module in range(modules):
         name = f"module{module}"
         at = _placed(MODULE_M * (module - 0.5 * modules), 0.0, turned=False)
@@ -336,7 +337,9 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
         corridor.append(_zone(seed, index, name, "corridor", *placed[-1]))
         for turned, kind in zip((False, True), ROOM_KINDS, strict=True):
             name = f"{kind}{module}"
-            pose = at @ _beside_corridor(turned)
+            # to the left of the corridor's direction, or rotated and on the right
+            x, y = (MODULE_M - along, -aside) if turned else (along, aside)
+            pose = at @ _placed(x, y, turned=turned)
             placed.append((build_room(recipes, kind, f"floor{index}/{name}"), pose))
             rooms.append(_zone(seed, index, name, kind, *placed[-1]))
     for turned in (False, True):
@@ -349,6 +352,9 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
         moved = new.moved(pose.rotation_matrix(), np.array(pose.translation))
         surfaces, own = surfaces.joined(moved), np.concatenate([own, new_own])
         lamps += [pose.apply(lamp[None])[0] for lamp in parts.lamps]
+    rng = stream(seed, "indoor", "frame", index)
+    translation = np.array([*rng.uniform(-6, 6, 2), rng.uniform(-0.5, 0.5)])  # floors overlap
+    official_from_place = settled_pose(about_z(rng.uniform(-np.pi, np.pi)), translation)
     zones = (*sorted(rooms, key=lambda zone: (zone.kind, zone.name)), *corridor)
     place = Place(
         index=index,
@@ -356,28 +362,15 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
         surfaces=surfaces,
         lamps=np.array(lamps),
         plan=zones[-1].plan,
-        place_from_world=_official_frame(seed, index).inverse(),
+        place_from_world=official_from_place.inverse(),
     )
     painters = np.array([recipe.painter for recipe in recipes.items])
     return Floor(place, zones, own, painters[surfaces.texture] == _GLASS)
 
 
-def _beside_corridor(turned: bool) -> RigidTransform:
-    """Return ``module_from_room``: to the left of the x direction, or rotated and on the right."""
-    x, y = 0.5 * (MODULE_M - ROOM_M[0]), 0.5 * CORRIDOR_M + WALL_THICKNESS_M
-    return _placed(MODULE_M - x, -y, turned=True) if turned else _placed(x, y, turned=False)
-
-
 def _placed(x: float, y: float, *, turned: bool) -> RigidTransform:
     sign = -1.0 if turned else 1.0
     return settled_pose(np.diag([sign, sign, 1.0]), np.array([x, y, 0.0]))
-
-
-def _official_frame(seed: int, index: int) -> RigidTransform:
-    """Return ``world_from_place`` of a floor; coordinates of different floors overlap."""
-    rng = stream(seed, "indoor", "frame", index)
-    translation = np.array([*rng.uniform(-6, 6, 2), rng.uniform(-0.5, 0.5)])
-    return settled_pose(about_z(rng.uniform(-np.pi, np.pi)), translation)
 
 
 def _zone(

@@ -43,13 +43,7 @@ def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
 
 def _rounded(function: np.ufunc) -> Callable[..., Float32]:
     """Compute the function in float64 and round to float32; angles are in radians."""
-
-    def rounded(*arguments: ArrayLike) -> Float32:
-        exact = function(*(np.asarray(values, np.float64) for values in arguments))
-        found: Float32 = exact.astype(np.float32)
-        return found
-
-    return rounded
+    return lambda *arguments: function(*arguments, dtype=np.float64).astype(np.float32)
 
 
 exp, sin, log2, arctan2 = (_rounded(f) for f in (np.exp, np.sin, np.log2, np.arctan2))

@@ -94,26 +94,17 @@ def _observations(
     pixels = np.zeros((len(points), len(frames), 2))
     for column, frame in enumerate(frames):
         in_camera = frame.cam_from_world.apply(points)
-        ahead = _in_field(frame.camera, in_camera)
+        z, squared_radius = in_camera[:, 2], (in_camera[:, :2] ** 2).sum(1)
+        # beyond the corners the distortion may be non-monotonic and project a point into the image
+        ahead = (z > 0) & (squared_radius <= _squared_reach(frame.camera) * z**2)
         px = project(frame.camera, np.where(ahead[:, None], in_camera, [0.0, 0.0, 1.0]))
         size = np.array([frame.camera.width, frame.camera.height])
         inside = ahead & ((px >= _BORDER_PX) & (px <= size - _BORDER_PX)).all(1)
         where = np.where(inside[:, None], px, 0.0).astype(np.int64)
-        z = in_camera[:, 2]
         error = np.abs(depths_m[frame.name][where[:, 1], where[:, 0]] - z)
         seen[:, column] = inside & (error < _DEPTH_TOLERANCE * z + _DEPTH_TOLERANCE_M)
         pixels[:, column] = px
     return seen, pixels
-
-
-def _in_field(camera: Camera, in_camera: Floats) -> Bools:
-    """Select points in front of the camera, no farther from its axis than the image's corners.
-
-    Beyond the corners the distortion may be non-monotonic and project a point into the image.
-    """
-    z = in_camera[:, 2]
-    inside = (in_camera[:, :2] ** 2).sum(1) <= _squared_reach(camera) * z**2
-    return np.asarray((z > 0) & inside, np.bool_)
 
 
 @cache

@@ -277,22 +277,20 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
     texture = store.material("ground", kind, (width, depth), "ground")
     corner = np.array([low[0], high[1], 0.0])
     builder.add(corner, np.array([width, 0.0, 0.0]), np.array([0.0, -depth, 0.0]), texture)
+    plan = _furnished(plan, Furniture(builder, rng, store.pick))
+    # on a loose grid, with a random rotation
+    columns = int(np.ceil(np.sqrt(options.num_places)))
+    middle = np.array([index % columns, index // columns, 0.0]) * _PLACE_DISTANCE_M
+    middle += np.array([*rng.uniform(-8, 8, 2), rng.uniform(-1, 1)])
+    world_from_place = settled_pose(about_z(rng.uniform(-np.pi, np.pi)), middle)
     return Place(
         index=index,
-        plan=_furnished(plan, Furniture(builder, rng, store.pick)),
+        plan=plan,
         recipes=tuple(store.recipes),
         surfaces=builder.build(),
         lamps=np.array(lamps).reshape(-1, 3),
-        place_from_world=_place_from_world(rng, index, options.num_places),
+        place_from_world=world_from_place.inverse(),
     )
-
-
-def _place_from_world(rng: np.random.Generator, index: int, num_places: int) -> RigidTransform:
-    """Return ``place_from_world`` of a place on a loose grid, with a random rotation."""
-    columns = int(np.ceil(np.sqrt(num_places)))
-    middle = np.array([index % columns, index // columns, 0.0]) * _PLACE_DISTANCE_M
-    middle += np.array([*rng.uniform(-8, 8, 2), rng.uniform(-1, 1)])
-    return settled_pose(about_z(rng.uniform(-np.pi, np.pi)), middle).inverse()
 
 
 def about_z(angle: float) -> NDArray[np.float64]:

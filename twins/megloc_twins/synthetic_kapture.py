@@ -168,7 +168,7 @@ def mapping_data(world: SyntheticWorld) -> KaptureData:
     for sensor_id, camera in rig_cameras(world.options).items():
         data.sensors[sensor_id] = Sensor.from_camera(camera, name=sensor_id)
         if world.options.depth:
-            depth_id = _depth_sensor(sensor_id)
+            depth_id = f"{sensor_id}_depth"
             data.sensors[depth_id] = Sensor.from_camera(camera, name=depth_id, sensor_type="depth")
             members[depth_id] = members[sensor_id]
     data.rigs[_RIG_ID] = members
@@ -177,7 +177,7 @@ def mapping_data(world: SyntheticWorld) -> KaptureData:
     for frame in world.mapping:
         data.records_camera[frame.timestamp, frame.sensor_id] = frame.name
         if world.options.depth:
-            record = frame.timestamp, _depth_sensor(frame.sensor_id)
+            record = frame.timestamp, f"{frame.sensor_id}_depth"
             data.records_depth[record] = depth_name(frame.name)
     return data
 
@@ -195,10 +195,6 @@ def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
 
 def depth_name(image: str) -> str:
     return f"depth/{PurePosixPath(image).with_suffix('.depth')}"
-
-
-def _depth_sensor(sensor_id: str) -> str:
-    return f"{sensor_id}_depth"
 
 
 def write_files(
