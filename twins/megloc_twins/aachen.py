@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 from pydantic import Field
 
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel
@@ -28,7 +28,7 @@ from megloc_twins.frames import (
 )
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticDataset, TwinOptions, shuffled, stream, write_lines
-from megloc_twins.portable import settled_pose
+from megloc_twins.portable import Float64, settled_pose
 from megloc_twins.sparse_models import (
     Depths,
     exact_tracks,
@@ -111,16 +111,16 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
 class AachenFrames:
     """All images of the twin, queries in the order of the lists, with poses in the world."""
 
-    database: tuple[Frame, ...]  # map images with separate cameras, in the order of the NVM
-    sequences: tuple[Frame, ...]  # map images, with one sensor per sequence
-    day: tuple[Frame, ...]
-    night: tuple[Frame, ...]  # queries of v1.0, then those added by v1.1
-    unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
+    database: list[Frame]  # map images with separate cameras, in the order of the NVM
+    sequences: list[Frame]  # map images, with one sensor per sequence
+    day: list[Frame]
+    night: list[Frame]  # queries of v1.0, then those added by v1.1
+    unlisted: list[Frame]  # below ``query/``, but in no list
 
-    def mapping(self) -> tuple[Frame, ...]:
+    def mapping(self) -> list[Frame]:
         return self.database + self.sequences
 
-    def queries(self) -> tuple[Frame, ...]:
+    def queries(self) -> list[Frame]:
         return self.day + self.night
 
 
@@ -130,13 +130,13 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
     # numbers of the database images, unordered and with gaps
     count = options.num_places * options.stations_per_place * len(_YAWS_DEG)
     numbers = stream(options.seed, "aachen", "numbers").permutation(2 * count + 50) + 1
-    numbers = numbers[numbers != _WRONG_IMAGE][:count]
+    numbers = numbers[numbers != _WRONG_IMAGE][:count].tolist()
     database: list[Frame] = []
     sequences: list[Frame] = []
     day: list[Frame] = []
     night: list[Frame] = []
-    num_day = options.day_queries
-    num_night = options.night_queries + options.additional_night_queries
+    num_day, num_v1_0 = options.day_queries, options.night_queries
+    num_night = num_v1_0 + options.additional_night_queries
     for index in range(options.num_places):
         place = build_place(world, index)
         album = _photographs(options, place, numbers[len(database) :])
@@ -144,24 +144,18 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
         sequences += _sequence(options, place)
         day += query_frames(world, place, album, "day", num_day + NUM_UNLISTED)
         night += query_frames(world, place, album, "night", num_night)
-
-    def ordered(frames: Sequence[Frame], label: str) -> tuple[Frame, ...]:
-        return tuple(shuffled(frames, options.seed, "aachen", "order", label))
-
     day, night = _as_telephones(day, "day", options), _as_telephones(night, "night", options)
     return AachenFrames(
-        database=ordered(database, "nvm"),
-        sequences=tuple(sequences),
-        day=ordered(day[:num_day], "day"),
-        night=ordered(night[: options.night_queries], "night")
-        + ordered(night[options.night_queries :], "additional"),
-        unlisted=tuple(day[num_day:]),
+        database=shuffled(database, options.seed, "aachen", "order", "nvm"),
+        sequences=sequences,
+        day=shuffled(day[:num_day], options.seed, "aachen", "order", "day"),
+        night=shuffled(night[:num_v1_0], options.seed, "aachen", "order", "night")
+        + shuffled(night[num_v1_0:], options.seed, "aachen", "order", "additional"),
+        unlisted=day[num_day:],
     )
 
 
-def _photographs(
-    options: AachenTwinOptions, place: Place, numbers: NDArray[np.int64]
-) -> list[Frame]:
+def _photographs(options: AachenTwinOptions, place: Place, numbers: list[int]) -> list[Frame]:
     """Return a place's map images, each with a separate camera, taken on two sunny days."""
     rng = stream(options.seed, "aachen", "database", place.index)
     suns = [(rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(40, 60))) for _ in range(2)]
@@ -170,7 +164,7 @@ def _photographs(
         # photographs of a day are consecutive, so that its shadow map is computed once
         sun = suns[2 * station // options.stations_per_place]
         for yaw_deg in _YAWS_DEG:
-            number = int(numbers[len(frames)])
+            number = numbers[len(frames)]
             at = np.array([*spot + rng.normal(0, 0.15, 2), rng.uniform(1.5, 1.9)])
             yaw = heading + np.radians(yaw_deg) + float(rng.normal(0, 0.1))
             camera = _photo_camera(options, rng)
@@ -207,10 +201,10 @@ def _map_frame(
     place: Place,
     names: tuple[str, str],
     camera: Camera,
-    at: NDArray[np.float64],
+    at: Float64,
     yaw: float,
     sun: tuple[float, float],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Frame:
     """Return a hand-held image at a position; ``names`` are those of image and sensor."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
@@ -228,9 +222,7 @@ def _map_frame(
     )
 
 
-def _photo_camera(
-    options: AachenTwinOptions, rng: np.random.Generator, *, portraits: bool = True
-) -> Camera:
+def _photo_camera(options: AachenTwinOptions, rng: Generator, *, portraits: bool = True) -> Camera:
     """Draw a SIMPLE_RADIAL camera with a central principal point, some in portrait format."""
     width, height = options.width, options.height
     focal, k = rng.uniform(0.7, 0.9) * width, rng.uniform(-0.1, 0.02)

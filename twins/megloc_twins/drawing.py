@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from megloc_twins.options import stream
@@ -37,9 +38,7 @@ _MASONRY: dict[str, tuple[int, int, float, float, float]] = {
 }
 
 
-def smooth_noise(
-    rng: np.random.Generator, height: int, width: int, *, cell: float, octaves: int = 4
-) -> Field2D:
+def smooth_noise(rng: Generator, height: int, width: int, *, cell: float, octaves: int) -> Field2D:
     """Return normalised noise; ``cell`` is the cell size of the coarsest octave, texels."""
     total = np.zeros((height, width), np.float32)
     amplitude = 1.0
@@ -57,9 +56,7 @@ def smooth_noise(
     return (total - total.mean()) / max(float(total.std()), 1e-6)
 
 
-def periodic_noise(
-    rng: np.random.Generator, size: int, *, cell: float, octaves: int = 4
-) -> Field2D:
+def periodic_noise(rng: Generator, size: int, *, cell: float, octaves: int = 4) -> Field2D:
     """Return noise like :func:`smooth_noise`, square and seamless when tiled."""
     white = rng.standard_normal((size, size))
     rows, columns = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
@@ -71,7 +68,7 @@ def periodic_noise(
 
 
 def random_colour(
-    rng: np.random.Generator, low: float = 30, high: float = 225, *, chroma: float = 0.75
+    rng: Generator, low: float = 30, high: float = 225, *, chroma: float = 0.75
 ) -> Colour:
     """Draw a random colour; ``chroma`` 0 gives grey, 1 the strongest colours of the range."""
     channels = rng.uniform(low, high, 3)
@@ -87,9 +84,7 @@ def shade(image: Picture | Colour, factor: Field2D) -> Picture:
     return image * factor[..., None]
 
 
-def draw_glyphs(
-    rng: np.random.Generator, image: Rgb, box: Box, colour: Colour, *, rows: int
-) -> None:
+def draw_glyphs(rng: Generator, image: Rgb, box: Box, colour: Colour, *, rows: int) -> None:
     """Fill ``box`` with lines of random letter-like strokes, in place."""
     x0, y0, x1, y1 = box
     line = (y1 - y0) / rows
@@ -112,7 +107,7 @@ def draw_glyphs(
             x += 0.85 * size
 
 
-def draw_shapes(rng: np.random.Generator, image: Rgb, count: int) -> None:
+def draw_shapes(rng: Generator, image: Rgb, count: int) -> None:
     """Draw random discs, polygons, rings and bars over the image, in place."""
     height, width = image.shape[:2]
     extent = min(height, width)
@@ -136,7 +131,7 @@ def draw_shapes(rng: np.random.Generator, image: Rgb, count: int) -> None:
             cv2.line(image, start, stop, colour, max(1, int(radius * 0.3)), *_SMOOTH)
 
 
-def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
+def draw_cracks(rng: Generator, image: Rgb, count: int) -> None:
     """Draw thin dark wandering lines over the image, in place."""
     height, width = image.shape[:2]
     for _ in range(count):
@@ -147,7 +142,7 @@ def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
         cv2.polylines(image, [points], False, (tone, tone, tone), 1, *_SMOOTH)
 
 
-def _blocks(rng: np.random.Generator, base: Colour, kind: str) -> Picture:
+def _blocks(rng: Generator, base: Colour, kind: str) -> Picture:
     rows, cols, spread, joint, joint_grey = _MASONRY[kind]
     y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
     v = (y + 0.5) / TILE * rows

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 from pydantic import Field
 
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
@@ -39,7 +39,7 @@ from megloc_twins.options import (
     stream,
     write_lines,
 )
-from megloc_twins.portable import settled, settled_pose
+from megloc_twins.portable import Float64, settled, settled_pose
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
 
@@ -68,10 +68,8 @@ _EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
 _GREY = np.array([299, 587, 114])  # weights of R, G and B, thousandths
 
 
-def _settled_earth_from_enu(
-    latitude_deg: float, longitude_deg: float, height_m: float
-) -> RigidTransform:
-    exact = earth_from_enu(latitude_deg, longitude_deg, height_m)
+def _settled_earth_from_enu(lat_deg: float, lon_deg: float, height_m: float) -> RigidTransform:
+    exact = earth_from_enu(lat_deg, lon_deg, height_m)
     # rounded to micrometres: ECEF coordinates have less than nanometre precision in float64
     return settled_pose(exact.rotation_matrix(), np.round(exact.translation, 6))
 
@@ -201,7 +199,7 @@ def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
     return replace(place, recipes=tuple(recipes))
 
 
-def _lighting(recording: str, rng: np.random.Generator, sun: tuple[float, float]) -> Lighting:
+def _lighting(recording: str, rng: Generator, sun: tuple[float, float]) -> Lighting:
     if recording == DUSK:
         night = night_lighting(rng, exposure=_DUSK_EXPOSURE)
         # the lamps are on, and the sky is still slightly bright
@@ -218,9 +216,9 @@ def _frames(
     place: Place,
     timestamp: int,
     cam0_from_world: RigidTransform,
-    position: NDArray[np.float64],
+    position: Float64,
     sun: tuple[float, float],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[Frame, ...]:
     moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
     lighting = _lighting(drive.name, rng, sun)
@@ -246,7 +244,7 @@ def _frames(
     return tuple(frames)
 
 
-def _free_offset(plan: FloorPlan, along: float, most: float, rng: np.random.Generator) -> float:
+def _free_offset(plan: FloorPlan, along: float, most: float, rng: Generator) -> float:
     """Draw a deviation to the left of the path, metres, that avoids all obstacles."""
     for _ in range(50):
         offset = float(rng.uniform(-most, most))
@@ -257,7 +255,7 @@ def _free_offset(plan: FloorPlan, along: float, most: float, rng: np.random.Gene
     return 0.0
 
 
-def _beside(plan: FloorPlan, along: float, offset: float) -> tuple[NDArray[np.float64], float]:
+def _beside(plan: FloorPlan, along: float, offset: float) -> tuple[Float64, float]:
     """Return position (2,) and direction (radians) of a car ``offset`` metres left of the path."""
     (ahead, behind, spot), _ = plan.on_path([along + _LOOK_AHEAD_M, along - 0.5, along])
     heading = float(np.arctan2(*(ahead - behind)[::-1]))
@@ -374,9 +372,7 @@ def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]
     return lines
 
 
-def _random_transform(
-    rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
-) -> RigidTransform:
+def _random_transform(rng: Generator, yaw: float, tilt: float, reach_m: float) -> RigidTransform:
     """Draw a translation, and a rotation by ``yaw`` about z and ``tilt`` about x and y at most."""
     half = rng.uniform(-1, 1, 3) * (tilt, tilt, yaw) / 2
     cos, sin = settled(np.cos(half)).tolist(), np.diag(settled(np.sin(half))).tolist()

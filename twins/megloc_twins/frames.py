@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.moving_objects import MovingObject
 from megloc_twins.options import seed_of
-from megloc_twins.portable import exp, product, settled, settled_pose
+from megloc_twins.portable import Float64, exp, product, settled, settled_pose
 
 Triple = tuple[float, float, float]
 Condition = Literal["day", "night"]
@@ -44,14 +44,12 @@ class Lighting:
     vignetting: float  # loss of light in the corners, 0..1
 
 
-def _triple(values: NDArray[np.float64]) -> Triple:
+def _triple(values: Float64) -> Triple:
     r, g, b = settled(values).tolist()
     return r, g, b
 
 
-def day_lighting(
-    rng: np.random.Generator, sun: tuple[float, float], *, overcast: float
-) -> Lighting:
+def day_lighting(rng: Generator, sun: tuple[float, float], *, overcast: float) -> Lighting:
     """Return daylight; exposure and white balance vary a little from image to image.
 
     Parameters
@@ -74,7 +72,7 @@ def day_lighting(
     )
 
 
-def night_lighting(rng: np.random.Generator, *, exposure: float = 1.0) -> Lighting:
+def night_lighting(rng: Generator, *, exposure: float = 1.0) -> Lighting:
     """Return night light: warm lamps, a faint blue sky, a noisy sensor and more blur."""
     return Lighting(
         condition="night",
@@ -92,7 +90,7 @@ def night_lighting(rng: np.random.Generator, *, exposure: float = 1.0) -> Lighti
     )
 
 
-def lamp_lighting(rng: np.random.Generator, *, noise: float, spread: float = 0.0) -> Lighting:
+def lamp_lighting(rng: Generator, *, noise: float, spread: float = 0.0) -> Lighting:
     """Return the light of ceiling lamps; ``spread`` is the variation between images."""
     light = float(exp(rng.normal(0, spread)))
     red, green, blue = np.exp(rng.normal(0, 0.35 * spread, 3)).tolist()
@@ -134,7 +132,7 @@ WEATHERS: dict[str, Weather] = {
 }
 
 
-def road_lighting(condition: str, rng: np.random.Generator, *, azimuth: float) -> Lighting:
+def road_lighting(condition: str, rng: Generator, *, azimuth: float) -> Lighting:
     """Return the lighting of an image of a traversal in one of the WEATHERS.
 
     ``azimuth`` is that of the sun, radians, in the place's frame.
@@ -160,9 +158,7 @@ def _product(a: Triple, b: Triple) -> Triple:
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
-def looking_at(
-    position: NDArray[np.float64], yaw: float, pitch: float, roll: float
-) -> RigidTransform:
+def looking_at(position: Float64, yaw: float, pitch: float, roll: float) -> RigidTransform:
     """Return ``cam_from_world`` of a camera at ``position`` (3,), metres, in a frame with z up.
 
     Its axis points along ``yaw`` (radians from +x towards +y) and ``pitch`` above the horizon;

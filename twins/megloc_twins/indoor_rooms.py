@@ -11,14 +11,13 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from megloc_kapture.values import RigidTransform
 from megloc_twins.moving_objects import FloorPlan, Obstacle, moving_object_recipes
 from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
-from megloc_twins.portable import product, settled_pose
+from megloc_twins.portable import Bools, Float64, product, settled_pose
 from megloc_twins.squares import Place, about_z
-from megloc_twins.surfaces import PASSAGE, Opening, SurfaceBuilder, Surfaces, Vector, Wall
+from megloc_twins.surfaces import PASSAGE, Opening, SurfaceBuilder, Surfaces, Wall
 from megloc_twins.textures import TextureRecipe, index_of, texels
 
 Point = tuple[float, float]
@@ -82,10 +81,10 @@ class Parts:
     high: Point
     shared: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # equal in all of its kind
     own: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # individual
-    lamps: list[Vector] = field(default_factory=list)
+    lamps: list[Float64] = field(default_factory=list)
     obstacles: list[Obstacle] = field(default_factory=list)
 
-    def surfaces(self) -> tuple[Surfaces, NDArray[np.bool_]]:
+    def surfaces(self) -> tuple[Surfaces, Bools]:
         """Return all surfaces, and a mask of the individual ones."""
         shared, own = self.shared.build(), self.own.build()
         return shared.joined(own), np.arange(len(shared) + len(own)) >= len(shared)
@@ -313,8 +312,8 @@ class Floor:
 
     place: Place
     zones: tuple[Zone, ...]  # rooms first, then corridor sections
-    own: NDArray[np.bool_]  # (N,), surfaces of individual objects of a zone
-    glass: NDArray[np.bool_]  # (N,), surfaces that return no laser beam
+    own: Bools  # (N,), surfaces of individual objects of a zone
+    glass: Bools  # (N,), surfaces that return no laser beam
 
 
 def floor_place(modules: int, options: SyntheticWorldOptions, index: int) -> Place:
@@ -346,7 +345,7 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
         pose = _placed((-0.5 if turned else 0.5) * MODULE_M * modules, 0.0, turned=turned)
         placed.append((_build_end(recipes, f"floor{index}/end{turned:d}"), pose))
     surfaces, own = SurfaceBuilder().build(), np.zeros(0, bool)
-    lamps: list[Vector] = []
+    lamps: list[Float64] = []
     for parts, pose in placed:  # place_from_part
         new, new_own = parts.surfaces()
         moved = new.moved(pose.rotation_matrix(), np.array(pose.translation))

@@ -9,6 +9,7 @@ from io import BytesIO
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.io import savemat
@@ -24,7 +25,7 @@ from megloc_twins.frames import Frame, lamp_lighting, looking_at, noise_seed, wr
 from megloc_twins.indoor_rooms import MODULE_M, Floor, Zone, build_floor, floor_place
 from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream, write_lines
-from megloc_twins.portable import product, settled
+from megloc_twins.portable import Bools, Float64, product, settled
 from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, visible
@@ -53,10 +54,8 @@ _MIN_SEEN, _MIN_MARGIN = 0.6, 0.2
 _QUARTER = Camera("SIMPLE_PINHOLE", 240, 320, (120.0, 120.0, 160.0))
 _MAX_ANGLE_DEG, _MAX_DISTANCE_RATIO = 35.0, 2.0
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 # centre of a scanner, and its views in all directions, up to the height of its cutouts
-ScanViews = tuple[Floats, list[CoarseView]]
+ScanViews = tuple[Float64, list[CoarseView]]
 
 
 class InLocTwinOptions(TwinOptions):
@@ -139,7 +138,7 @@ def _cutouts(
     return frames
 
 
-def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform:
+def _displaced(pose: RigidTransform, rng: Generator) -> RigidTransform:
     """Return a scan's pose before refinement: slightly displaced and rotated."""
     half = 0.5 * float(rng.normal(0, 0.02))
     w, z = settled((np.cos(half), np.sin(half))).tolist()
@@ -179,8 +178,8 @@ def scanned_points(
     cam_from_place: RigidTransform,
     cam_from_scan: RigidTransform,
     image: NDArray[np.uint8],
-    rng: np.random.Generator,
-) -> Floats:
+    rng: Generator,
+) -> Float64:
     """Return the scanned point of each pixel of a cutout, (H, W, 3), metres in the scan's frame.
 
     Pixels without a return are NaN: on glass, where ``image``, uint8 (H, W, 3), is dark, far away,
@@ -259,12 +258,12 @@ def build_queries(options: InLocTwinOptions) -> list[Frame]:
 
 
 def _query_poses(
-    floors: Sequence[Floor],
+    floors: list[Floor],
     index: int,
     zone: Zone,
     camera: Camera,
     scans: Sequence[Sequence[ScanViews]],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Iterator[tuple[float, tuple[RigidTransform, float]]]:
     """Yield misfit, pose and yaw of random poses in a zone; worse ones are mostly skipped."""
     floor, plan = floors[index], zone.plan
@@ -296,9 +295,7 @@ def _query_poses(
         yield miss, (pose, yaw)
 
 
-def _copies(
-    floors: Sequence[Floor], index: int, zone: Zone
-) -> Iterator[tuple[int, RigidTransform]]:
+def _copies(floors: list[Floor], index: int, zone: Zone) -> Iterator[tuple[int, RigidTransform]]:
     """Yield floor and transform to each zone of the kind; for corridors also a half turn."""
     half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (MODULE_M, 0.0, 0.0))
     for other_index, floor in enumerate(floors):
@@ -318,7 +315,7 @@ def _scan_views(floor: Floor, zone: Zone) -> ScanViews:
     return zone.scan_from_place.center(), views
 
 
-def _have_seen(scans: Sequence[ScanViews], points: Floats, position: Floats) -> Bools:
+def _have_seen(scans: Sequence[ScanViews], points: Float64, position: Float64) -> Bools:
     """Select points (P, 3) that a scan saw from a viewpoint similar to ``position`` (3,)."""
     found = np.zeros(len(points), bool)
     here = points - position
@@ -336,7 +333,7 @@ def _have_seen(scans: Sequence[ScanViews], points: Floats, position: Floats) -> 
 
 
 def _people(
-    zone: Zone, pose: RigidTransform, yaw: float, rng: np.random.Generator
+    zone: Zone, pose: RigidTransform, yaw: float, rng: Generator
 ) -> tuple[MovingObject, ...]:
     """Place up to two people in front of the phone, in half of the images."""
     people: list[MovingObject] = []

@@ -7,13 +7,14 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.random import Generator
+from numpy.typing import ArrayLike
 
 from megloc_twins.options import seed_of
+from megloc_twins.portable import Float64
 from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from megloc_twins.textures import TextureRecipe
 
-Floats = NDArray[np.float64]
 Kind = Literal["person", "car"]
 
 # outline (counter-clockwise) and closed path of the mapping rig, metres
@@ -58,8 +59,8 @@ class FloorPlan:
     (M, 2), is the closed path of the mapping rig.
     """
 
-    outline: Floats
-    path: Floats
+    outline: Float64
+    path: Float64
     obstacles: tuple[Obstacle, ...] = ()
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
@@ -75,7 +76,7 @@ class FloorPlan:
     def path_length_m(self) -> float:
         return float(np.hypot(*(np.roll(self.path, -1, axis=0) - self.path).T).sum())
 
-    def on_path(self, distance_m: ArrayLike) -> tuple[Floats, Floats]:
+    def on_path(self, distance_m: ArrayLike) -> tuple[Float64, Float64]:
         """Return positions (..., 2) and headings (radians) at distances (...) along the path."""
         along = np.roll(self.path, -1, axis=0) - self.path
         lengths = np.hypot(*along.T)
@@ -86,20 +87,20 @@ class FloorPlan:
         heading = np.arctan2(along[leg, 1], along[leg, 0])
         return self.path[leg] + part[..., None] * along[leg], heading
 
-    def stops(self, count: int) -> list[tuple[Floats, float]]:
+    def stops(self, count: int) -> list[tuple[Float64, float]]:
         """Return equidistant positions (2,) along the path, with the headings (radians)."""
         spots, headings = self.on_path((np.arange(count) + 0.5) / count * self.path_length_m)
         return list(zip(spots, headings.tolist(), strict=True))
 
 
-def draw_floor_plan(rng: np.random.Generator, index: int) -> FloorPlan:
+def draw_floor_plan(rng: Generator, index: int) -> FloorPlan:
     """Return the empty floor plan of place ``index``: one of four shapes, slightly stretched."""
     outline, path = (np.array(shape) for shape in _SHAPES[index % len(_SHAPES)])
     stretch = rng.uniform(0.94, 1.06, 2)
     return FloorPlan(outline * stretch, path * stretch)
 
 
-def _distance_inside(x: float, y: float, ring: Floats) -> float:
+def _distance_inside(x: float, y: float, ring: Float64) -> float:
     """Return the distance of (x, y) from a polygon, negative outside it."""
     return cv2.pointPolygonTest(ring.astype(np.float32), (x, y), True)
 
@@ -133,11 +134,7 @@ def moving_object_recipes(seed: int) -> list[TextureRecipe]:
 
 
 def place_moving_objects(
-    plan: FloorPlan,
-    rng: np.random.Generator,
-    count: int,
-    position: Floats,
-    yaw: float | None = None,
+    plan: FloorPlan, rng: Generator, count: int, position: Float64, yaw: float | None = None
 ) -> tuple[MovingObject, ...]:
     """Place up to ``count`` people and cars near a position (x, y first; metres, place's frame).
 

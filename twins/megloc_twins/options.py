@@ -9,6 +9,7 @@ from typing import ClassVar, Generic, TypeVar
 from zlib import crc32
 
 import numpy as np
+from numpy.random import Generator
 from pydantic import Field
 
 from megloc_kapture.io.files import write_bytes
@@ -50,7 +51,7 @@ class SyntheticWorldOptions(TwinOptions):
     masks: bool = Field(default=False, description="write masks of the bonnet")
 
 
-def stream(seed: int, *labels: str | int) -> np.random.Generator:
+def stream(seed: int, *labels: str | int) -> Generator:
     """Return the generator of an object or choice with these ``labels``, independent of others."""
     return np.random.default_rng([seed, crc32("/".join(map(str, labels)).encode())])
 

@@ -22,6 +22,7 @@ _CUBIC = -0.75  # slope of the kernel at distance 1, as in OpenCV
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 
 def settled(values: ArrayLike) -> Float64:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.portable import Float32, Float64, log2
+from megloc_twins.portable import Bools, Float32, Float64, log2
 from megloc_twins.surfaces import NUM_LEVELS, Atlas, Surfaces
 
 NEAR_M = 0.05
@@ -140,7 +140,7 @@ def _cover(
                     surface[row, column] = index
 
 
-def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64, Bools]:
     """Return forms (N, 3, 3) of 1/z, u/z, v/z, and a mask of surfaces that face the camera."""
     normal = np.cross(edge_u, edge_v)  # away from a viewer in front
     offset = np.einsum("ni,ni->n", normal, origin)

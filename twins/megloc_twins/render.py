@@ -23,7 +23,17 @@ from megloc_twins.drawing import periodic_noise
 from megloc_twins.frames import Frame, Lighting, Triple
 from megloc_twins.moving_objects import moving_object_surfaces
 from megloc_twins.options import SyntheticWorldOptions, stream
-from megloc_twins.portable import Float32, arctan2, averaged, blurred, exp, product, resized
+from megloc_twins.portable import (
+    Bools,
+    Float32,
+    Float64,
+    arctan2,
+    averaged,
+    blurred,
+    exp,
+    product,
+    resized,
+)
 from megloc_twins.rasterization import (
     NO_SURFACE,
     Visibility,
@@ -39,7 +49,6 @@ from megloc_twins.textures import TextureRecipe
 
 Result = TypeVar("Result")
 PlaceBuilder = Callable[[SyntheticWorldOptions, int], Place]
-Mask = NDArray[np.bool_]
 
 _FRAMES_PER_BATCH = 13  # each batch paints the textures, which takes as long as four frames
 _BONNET_COVERS = 0.5  # covered share of a pixel above which mask and depth exclude it
@@ -55,8 +64,8 @@ _CLOUD_SIZE = 512
 class ShadowMap:
     """Largest height along the sun's direction, on a grid of lines parallel to it."""
 
-    axes: NDArray[np.float64]  # (3, 3), rows: the grid's x and y directions and the sun's
-    low: NDArray[np.float64]  # (2,), the grid's corner
+    axes: Float64  # (3, 3), rows: the grid's x and y directions and the sun's
+    low: Float64  # (2,), the grid's corner
     step: float  # grid spacing, metres
     height: Float32  # (_SHADOW_SIZE, _SHADOW_SIZE), metres along the sun's direction
 
@@ -186,7 +195,7 @@ class RenderedFrame:
 
     image: NDArray[np.uint8]  # (H, W, 3), RGB
     depth_m: Float32 | None  # (H, W)
-    mask: Mask  # (H, W), False on the bonnet
+    mask: Bools  # (H, W), False on the bonnet
 
 
 def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
@@ -268,7 +277,7 @@ class PlaceRenderer:
         return result
 
     def _sky(
-        self, seen: Visibility, where: Mask, lighting: Lighting, cam_from_place: RigidTransform
+        self, seen: Visibility, where: Bools, lighting: Lighting, cam_from_place: RigidTransform
     ) -> Float32:
         rotation = cam_from_place.rotation_matrix().astype(np.float32)
         gx = np.broadcast_to(seen.grid.x, where.shape)[where].astype(np.float32)

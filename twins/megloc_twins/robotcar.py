@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 from pydantic import Field
 
 from megloc_kapture.datasets.robotcar import Layout
@@ -37,7 +37,7 @@ from megloc_twins.options import (
     stream,
     write_lines,
 )
-from megloc_twins.portable import settled_pose
+from megloc_twins.portable import Float64, settled_pose
 from megloc_twins.sparse_models import (
     Depths,
     exact_tracks,
@@ -192,7 +192,7 @@ def _moment(
     number: int,
     car_from_place: RigidTransform,
     azimuth: float,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> list[Frame]:
     """Return the three cameras' frames at a moment of a traversal, in the order of CAMERAS."""
     jitter = int(rng.integers(0, 1000))
@@ -224,10 +224,7 @@ def _moment(
 
 
 def _query_poses(
-    options: RobotCarTwinOptions,
-    place: Place,
-    map_views: list[CoarseView],
-    rng: np.random.Generator,
+    options: RobotCarTwinOptions, place: Place, map_views: list[CoarseView], rng: Generator
 ) -> Iterator[tuple[float, RigidTransform]]:
     """Yield the misfit of the scored camera's view and ``car_from_place``, near the map's path."""
     camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], CAM_FROM_CAR[SCORED_CAMERA]
@@ -243,9 +240,7 @@ def _query_poses(
             yield misfit(view, map_views, min_overlap=_MIN_OVERLAP), pose
 
 
-def _car_from_place(
-    spot: NDArray[np.float64], yaw: float, rng: np.random.Generator
-) -> RigidTransform:
+def _car_from_place(spot: Float64, yaw: float, rng: Generator) -> RigidTransform:
     """Return the pose of a slightly tilted car at a position (2,) that drives along ``yaw``."""
     pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
     height = _CAMERA_HEIGHT_M + float(rng.normal(0, 0.02))
@@ -311,9 +306,7 @@ def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
             write_lines(path, names, last_line_ends=False)
 
 
-def _write_version_2(
-    layout: Layout, options: RobotCarTwinOptions, queries: Sequence[Frame]
-) -> None:
+def _write_version_2(layout: Layout, options: RobotCarTwinOptions, queries: list[Frame]) -> None:
     """Write version 2's lists: half of each traversal's moments have poses, a few are missing."""
     train: list[Frame] = []
     test: list[Frame] = []

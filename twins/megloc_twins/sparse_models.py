@@ -11,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 
 from megloc_kapture.datasets.nvm import NvmModel
 from megloc_kapture.io.colmap import load_pycolmap, new_colmap_camera, new_colmap_pose
@@ -21,6 +21,7 @@ from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 from megloc_twins.frames import Frame
 from megloc_twins.options import JPEG_QUALITY, TwinOptions, write_lines
+from megloc_twins.portable import Bools, Float32, Float64
 from megloc_twins.rasterization import intrinsics, project, sample_grid
 from megloc_twins.render import RenderedFrame, render_frames
 
@@ -31,23 +32,16 @@ _DEPTH_TOLERANCE = 0.01
 _DEPTH_TOLERANCE_M = 0.02
 _GREY = 128  # depth maps have no colours
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Depth = NDArray[np.float32]
-Depths = Mapping[str, Depth]
+Depths = Mapping[str, Float32]
 
 
 def exact_tracks(
-    frames: Sequence[Frame],
-    depths_m: Depths,
-    rng: np.random.Generator,
-    *,
-    points_per_frame: int = 100,
+    frames: Sequence[Frame], depths_m: Depths, rng: Generator, *, points_per_frame: int = 100
 ) -> SparsePoints:
     """Create sparse points seen in at least two frames, with exact observations.
 
     Pixels with depth are drawn at random in every frame, lifted to world points and projected into
-    all frames of the same place whose depth agrees. Depth, float32 (H, W) by image name, is 0
+    all frames of the same place whose depth agrees. Float32, float32 (H, W) by image name, is 0
     without a surface. Observations are sorted by point, then image; ``feature_ids`` count from 0 in
     each image.
     """
@@ -76,7 +70,7 @@ def exact_tracks(
     return joined
 
 
-def _lifted(frame: Frame, depth_m: Depth, count: int, rng: np.random.Generator) -> Floats:
+def _lifted(frame: Frame, depth_m: Float32, count: int, rng: Generator) -> Float64:
     """Lift random pixels with depth to world points (P, 3), P <= count."""
     rows, columns = np.nonzero(depth_m > 0)
     drawn = rng.permutation(len(rows))[:count]
@@ -86,9 +80,7 @@ def _lifted(frame: Frame, depth_m: Depth, count: int, rng: np.random.Generator) 
     return frame.cam_from_world.inverse().apply(in_camera)
 
 
-def _observations(
-    frames: Sequence[Frame], depths_m: Depths, points: Floats
-) -> tuple[Bools, Floats]:
+def _observations(frames: list[Frame], depths_m: Depths, points: Float64) -> tuple[Bools, Float64]:
     """Return visibility, bool (P, S), of points (P, 3) in frames, and pixels, float64 (P, S, 2)."""
     seen = np.zeros((len(points), len(frames)), bool)
     pixels = np.zeros((len(points), len(frames), 2))
@@ -129,7 +121,7 @@ def render_map_and_queries(
     return {name: depth for name, depth in drawn.items() if depth is not None}
 
 
-def _write(images: Path, frame: Frame, view: RenderedFrame) -> Depth | None:
+def _write(images: Path, frame: Frame, view: RenderedFrame) -> Float32 | None:
     write_image(images / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
     return view.depth_m
 

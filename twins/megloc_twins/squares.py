@@ -11,14 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 
 from megloc_kapture.values import RigidTransform
 from megloc_twins.frames import Frame
 from megloc_twins.moving_objects import FloorPlan, Obstacle, draw_floor_plan, moving_object_recipes
 from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
-from megloc_twins.portable import settled_pose
-from megloc_twins.surfaces import Opening, SurfaceBuilder, Surfaces, Vector, Wall
+from megloc_twins.portable import Float64, settled_pose
+from megloc_twins.surfaces import Opening, SurfaceBuilder, Surfaces, Wall
 from megloc_twins.textures import GROUND_TEXELS_PER_M, TextureRecipe, index_of, texels
 
 Point = tuple[float, float]
@@ -65,7 +65,7 @@ class Furniture:
     """Builder of furniture at a point (x, y in metres); ``pick`` returns a texture of a kind."""
 
     builder: SurfaceBuilder
-    rng: np.random.Generator
+    rng: Generator
     pick: TexturePicker
 
     def crates(self, at: Point) -> None:
@@ -117,10 +117,10 @@ class Facade:
     """Facade of a house: a wall with windows, doors and attachments."""
 
     wall: Wall
-    rng: np.random.Generator
+    rng: Generator
     pick: TexturePicker
 
-    def build(self) -> list[Vector]:
+    def build(self) -> list[Float64]:
         """Furnish the wall; return the positions of its lamps, float64 (3,) each, metres."""
         wall, rng = self.wall, self.rng
         num_bays = max(1, int(round(wall.length / rng.uniform(2.3, 3.0))))
@@ -152,7 +152,7 @@ class Facade:
             lamps.append(wall.point(x, 3.1, 0.45))
         return lamps
 
-    def _ground_bay(self, left: float, right: float, openings: list[Opening]) -> None:
+    def _ground_bay(self, left: float, right: float, holes: list[Opening]) -> None:
         rng = self.rng
         kind = str(rng.choice(list(_BAYS), p=[share for share, *_ in _BAYS.values()]))
         if kind == "posters":
@@ -164,24 +164,22 @@ class Facade:
         shift = rng.uniform(-0.2, 0.2)
         x0, x1 = middle + shift - half, middle + shift + half
         recess, texture = rng.uniform(0.15, 0.35), self.pick(kind)
-        openings.append(Opening(x0, x1, y0, y1, recess, texture, 0.25 * float(rng.random() < 0.2)))
+        holes.append(Opening(x0, x1, y0, y1, recess, texture, 0.25 * float(rng.random() < 0.2)))
         if kind == "window":
-            self._ledge(openings[-1])
+            self._ledge(holes[-1])
         if rng.random() < 0.5:  # a sign
             half = min(0.95, (right - left) / 2 - 0.1)
             depth = rng.uniform(0.06, 0.2)
             span = (middle - half, middle + half)
             self.wall.block(span, (2.62, 2.62 + 0.5), depth, self.pick("sign"), self.wall.trim)
 
-    def _upper_window(
-        self, left: float, right: float, common: int, openings: list[Opening]
-    ) -> None:
+    def _upper_window(self, left: float, right: float, common: int, holes: list[Opening]) -> None:
         rng, middle, half = self.rng, (left + right) / 2, min(0.6, (right - left) / 2 - 0.25)
         window = common if rng.random() < 0.6 else self.pick("window")
         y0, y1 = _GROUND_STOREY_M + 0.75, _GROUND_STOREY_M + 2.3
         glow = 0.6 * float(rng.random() < 0.25)
         hole = Opening(middle - half, middle + half, y0, y1, 0.22, window, glow)
-        openings.append(hole)
+        holes.append(hole)
         if rng.random() < 0.3:  # a balcony
             span = (max(0.0, hole.x0 - 0.25), min(self.wall.length, hole.x1 + 0.25))
             self.wall.block(span, (y0 - 0.55, y0 + 0.2), 0.6, self.pick("wood"), self.pick("plain"))
@@ -212,7 +210,7 @@ class Place:
     index: int  # in its world
     recipes: tuple[TextureRecipe, ...]  # its textures, those of moving objects first
     surfaces: Surfaces  # ``texture`` indexes ``recipes``
-    lamps: NDArray[np.float64]  # (L, 3), sources of light at night
+    lamps: Float64  # (L, 3), sources of light at night
     plan: FloorPlan  # free ground
     place_from_world: RigidTransform
 
@@ -231,7 +229,7 @@ class _TextureStore:
 
     seed: int
     place: int
-    rng: np.random.Generator
+    rng: Generator
     recipes: list[TextureRecipe]
 
     def pick(self, kind: str) -> int:
@@ -261,7 +259,7 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
     seed, recipes = options.seed, moving_object_recipes(options.seed)
     store = _TextureStore(seed, index, stream(seed, "textures", index), recipes)
     builder = SurfaceBuilder()
-    lamps: list[Vector] = []
+    lamps: list[Float64] = []
     ends = np.roll(plan.outline, -1, axis=0)
     # seen from inside, a counter-clockwise outline runs to the left
     for number, (end, start) in enumerate(zip(plan.outline, ends, strict=True)):
@@ -293,7 +291,7 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
     )
 
 
-def about_z(angle: float) -> NDArray[np.float64]:
+def about_z(angle: float) -> Float64:
     """Return the rotation matrix (3, 3) about z by an angle in radians."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_twins.portable import product, settled
+from megloc_twins.portable import Float64, product, settled
 
-Vector = NDArray[np.float64]
 Span = tuple[float, float]
 Part = tuple[float, float, float, float]  # u0, v0, u1, v1 of a texture
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
@@ -29,27 +28,27 @@ class Surfaces:
     ``edge_u x edge_v`` points away from the viewer. In metres.
     """
 
-    origin: Vector  # (N, 3), the corner where the texture begins
-    edge_u: Vector  # (N, 3)
-    edge_v: Vector  # (N, 3)
+    origin: Float64  # (N, 3), the corner where the texture begins
+    edge_u: Float64  # (N, 3)
+    edge_v: Float64  # (N, 3)
     texture: NDArray[np.int32]  # (N,), index of the texture
-    uv: Vector  # (N, 4): the part (u0, v0, u1, v1) of the texture shown, 0..1
+    uv: Float64  # (N, 4): the part (u0, v0, u1, v1) of the texture shown, 0..1
     glow: NDArray[np.float32]  # (N,), emitted light at night, relative to the colour
 
     def __len__(self) -> int:
         return len(self.texture)
 
-    def normals(self) -> Vector:
+    def normals(self) -> Float64:
         """Return unit normals towards the viewer, float64 (N, 3)."""
         normal = np.cross(self.edge_v, self.edge_u)
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
-    def corners(self) -> Vector:
+    def corners(self) -> Float64:
         """Return the corners in order, float64 (N, 4, 3)."""
         o, u, v = self.origin, self.edge_u, self.edge_v
         return np.stack([o, o + u, o + u + v, o + v], axis=1)
 
-    def moved(self, rotation: Vector, translation: Vector) -> Surfaces:
+    def moved(self, rotation: Float64, translation: Float64) -> Surfaces:
         """Return the surfaces after ``x -> rotation x + translation``."""
         return replace(
             self,
@@ -67,13 +66,13 @@ class Surfaces:
 class SurfaceBuilder:
     """Collector of parallelograms and boxes."""
 
-    _rows: list[tuple[Vector, Vector, Vector, int, Part, float]] = field(default_factory=list)
+    _rows: list[tuple[Float64, Float64, Float64, int, Part, float]] = field(default_factory=list)
 
     def add(
         self,
-        origin: Vector,
-        edge_u: Vector,
-        edge_v: Vector,
+        origin: Float64,
+        edge_u: Float64,
+        edge_v: Float64,
         texture: int,
         *,
         uv: Part = WHOLE,
@@ -151,9 +150,9 @@ class Wall:
     """A wall from ``start`` to the right, seen from inside; its parts are added to ``builder``."""
 
     builder: SurfaceBuilder
-    start: Vector  # (3,), lower left corner, metres
-    right: Vector  # (3,), unit vector
-    inward: Vector  # (3,), unit vector towards the viewer
+    start: Float64  # (3,), lower left corner, metres
+    right: Float64  # (3,), unit vector
+    inward: Float64  # (3,), unit vector towards the viewer
     length: float  # metres
     texture: int  # of the wall itself, stretched over its length and height
     trim: int  # texture of ledges, reveals and pilasters
@@ -163,7 +162,7 @@ class Wall:
     def between(
         cls,
         builder: SurfaceBuilder,
-        ends: tuple[Vector, Vector],
+        ends: tuple[Float64, Float64],
         texture: int,
         trim: int,
         height: float,
@@ -176,7 +175,7 @@ class Wall:
         start = np.array([*start, 0.0])
         return cls(builder, start, right, inward, length, texture, trim, height)
 
-    def point(self, x: float, y: float, out: float = 0.0) -> Vector:
+    def point(self, x: float, y: float, out: float = 0.0) -> Float64:
         """Return the point at ``x`` along, ``y`` above the foot and ``out`` of the wall, metres."""
         return self.start + x * self.right + out * self.inward + np.array([0.0, 0.0, y])
 

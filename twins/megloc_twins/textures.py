@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from megloc_twins.drawing import (
     TILE,
@@ -28,7 +27,7 @@ from megloc_twins.drawing import (
     to_rgb,
 )
 from megloc_twins.options import stream
-from megloc_twins.portable import resized, sin
+from megloc_twins.portable import Float64, resized, sin
 
 GROUND_TEXELS_PER_M = 80
 
@@ -180,7 +179,7 @@ def paint_door(rng: Generator, height: int, width: int) -> Rgb:
     return image
 
 
-def _planks(rng: Generator, count: int, texels: int, *, seam: float) -> NDArray[np.float64]:
+def _planks(rng: Generator, count: int, texels: int, *, seam: float) -> Float64:
     """Return the tones (texels,) of adjacent boards, each with a dark seam at its beginning."""
     tone = rng.normal(1, 0.12, count).astype(np.float32)
     at = np.arange(texels)

@@ -8,6 +8,7 @@ from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from megloc_kapture.values import Camera, RigidTransform
@@ -22,6 +23,7 @@ from megloc_twins.frames import (
 )
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.portable import Bools, Float32, Float64
 from megloc_twins.rasterization import depth_map, intrinsics, project, sample_grid, visible_surfaces
 from megloc_twins.squares import Place
 from megloc_twins.surfaces import Surfaces
@@ -38,8 +40,6 @@ _MIN_SUPPORT = 0.6  # share of a query's view that the map covers
 _ATTEMPTS = 300
 
 Item = TypeVar("Item")
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +53,9 @@ class CoarseView:
 
     camera: Camera
     cam_from_world: RigidTransform
-    depth: NDArray[np.float32]
-    points: Floats
-    normals: Floats
+    depth: Float32
+    points: Float64
+    normals: Float64
     surface: NDArray[np.int16]
 
 
@@ -79,7 +79,7 @@ def coarse_view(
     return CoarseView(grid.camera, cam_from_world, depth, points, normals, surface)
 
 
-def visible(points: Floats, view: CoarseView) -> Bools:
+def visible(points: Float64, view: CoarseView) -> Bools:
     """Return the visibility, bool (P,), of points (P, 3) in a view."""
     in_camera = view.cam_from_world.apply(points)
     z = in_camera[:, 2]
@@ -116,7 +116,7 @@ def support(view: CoarseView, others: Sequence[CoarseView]) -> float:
     return float((matches & pairs.any(axis=1)).any(axis=0).mean())
 
 
-def _aspect(points_of: CoarseView, view: CoarseView) -> tuple[Floats, Floats, Floats]:
+def _aspect(points_of: CoarseView, view: CoarseView) -> tuple[Float64, Float64, Float64]:
     """Return unit rays (P, 3), sizes and slants (P,) of a view's points as seen in ``view``."""
     difference = points_of.points - view.cam_from_world.center()
     distance = np.linalg.norm(difference, axis=1)
@@ -125,7 +125,7 @@ def _aspect(points_of: CoarseView, view: CoarseView) -> tuple[Floats, Floats, Fl
     return rays, intrinsics(view.camera)[0] / distance, slant
 
 
-def _similar(cosine: Floats, size_ratio: Floats, slant_ratio: Floats) -> Bools:
+def _similar(cosine: Float64, size_ratio: Float64, slant_ratio: Float64) -> Bools:
     limit = np.log(_MAX_SIZE_RATIO)
     similar: Bools = cosine > np.cos(np.radians(_MAX_ANGLE_DEG))
     return similar & (np.abs(np.log(size_ratio)) < limit) & (np.abs(np.log(slant_ratio)) < limit)
@@ -179,7 +179,7 @@ def views_of(place: Place, frames: Iterable[Frame]) -> list[CoarseView]:
     ]
 
 
-def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Camera:
+def query_camera(options: SyntheticWorldOptions, rng: Generator) -> Camera:
     """Draw a phone's camera: focal length, principal point and distortion."""
     width, height = options.width, options.height
     focal = rng.uniform(0.7, 0.95) * width
@@ -188,8 +188,8 @@ def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Ca
 
 
 def _query_poses(
-    place: Place, camera: Camera, map_views: list[CoarseView], rng: np.random.Generator
-) -> Iterator[tuple[float, tuple[Floats, float, RigidTransform]]]:
+    place: Place, camera: Camera, map_views: list[CoarseView], rng: Generator
+) -> Iterator[tuple[float, tuple[Float64, float, RigidTransform]]]:
     """Yield the :func:`misfit` of random viewpoints away from obstacles, and the viewpoint.
 
     A viewpoint is a position (3,), a yaw and ``cam_from_place``.
