@@ -17,15 +17,7 @@ from pydantic import Field
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
-from megloc_twins.frames import (
-    Condition,
-    Frame,
-    day_lighting,
-    in_frame,
-    looking_at,
-    noise_seed,
-    write_truth,
-)
+from megloc_twins.frames import Frame, day_lighting, in_frame, looking_at, noise_seed, write_truth
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticDataset, TwinOptions, shuffled, stream, write_lines
 from megloc_twins.portable import Float64, settled_pose
@@ -237,9 +229,7 @@ def _simple_radial(width: int, height: int, focal: float, k: float) -> Camera:
     return Camera("SIMPLE_RADIAL", width, height, params)
 
 
-def _as_telephones(
-    frames: Sequence[Frame], condition: Condition, options: AachenTwinOptions
-) -> list[Frame]:
+def _as_telephones(frames: list[Frame], condition: str, options: AachenTwinOptions) -> list[Frame]:
     """Return the queries sorted by number, with names of phones as in the lists."""
     renamed = []
     for number, frame in enumerate(sorted(frames, key=lambda frame: frame.timestamp)):

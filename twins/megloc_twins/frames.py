@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.random import Generator
@@ -18,7 +17,6 @@ from megloc_twins.options import seed_of
 from megloc_twins.portable import Float64, exp, product, settled, settled_pose
 
 Triple = tuple[float, float, float]
-Condition = Literal["day", "night"]
 
 _DARK: Triple = (0.0, 0.0, 0.0)
 _UP: Triple = (0.0, 0.0, 1.0)
@@ -28,7 +26,7 @@ _UP: Triple = (0.0, 0.0, 1.0)
 class Lighting:
     """Light and sensor of one image; colours are RGB, directions in the place's frame."""
 
-    condition: Condition = "day"
+    night: bool = False  # stray light around lamps
     sun_direction: Triple = _UP  # unit vector towards the sun
     sun: Triple = _DARK  # on a surface that faces the sun
     sky: Triple  # on a surface that faces up; others get less
@@ -75,7 +73,7 @@ def day_lighting(rng: Generator, sun: tuple[float, float], *, overcast: float) -
 def night_lighting(rng: Generator, *, exposure: float = 1.0) -> Lighting:
     """Return night light: warm lamps, a faint blue sky, a noisy sensor and more blur."""
     return Lighting(
-        condition="night",
+        night=True,
         lamps=_triple(np.array([1.0, 0.74, 0.42]) * rng.uniform(0.8, 1.2)),
         sky=_triple(np.array([0.014, 0.016, 0.022]) * rng.uniform(0.7, 1.3)),
         glow=(1.0, 0.85, 0.6),
@@ -219,10 +217,7 @@ def noise_seed(seed: int, image: str) -> int:
 def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> list[Frame]:
     """Convert the frames' poses to the coordinates of the published dataset."""
     world_from_official = official_from_world.inverse()
-    return [
-        replace(frame, cam_from_world=frame.cam_from_world @ world_from_official)
-        for frame in frames
-    ]
+    return [replace(f, cam_from_world=f.cam_from_world @ world_from_official) for f in frames]
 
 
 def kapture_records(frames: Iterable[Frame], *, poses: bool = True) -> KaptureData:

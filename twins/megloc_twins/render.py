@@ -90,10 +90,8 @@ def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
     flat = product(surfaces.corners(), axes.T)[..., :2]
     low, high = flat.min((0, 1)) - 0.1, flat.max((0, 1)) + 0.1
     step = float((high - low).max() / _SHADOW_SIZE)
-    nothing = ShadowMap(
-        axes, low, step, np.full((_SHADOW_SIZE, _SHADOW_SIZE), _NOTHING, np.float32)
-    )
-    return add_shadows(nothing, surfaces)
+    height = np.full((_SHADOW_SIZE, _SHADOW_SIZE), _NOTHING, np.float32)
+    return add_shadows(ShadowMap(axes, low, step, height), surfaces)
 
 
 def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
@@ -143,7 +141,7 @@ def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDAr
     y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
     squared_radius = (x[None] ** 2 + y[:, None] ** 2) / 2  # 1 in the corners
     signal *= (1 - np.float32(lighting.vignetting) * squared_radius)[..., None]
-    if lighting.condition == "night":  # stray light around lamps
+    if lighting.night:  # stray light around lamps
         haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
         signal = signal + np.float32(0.06) * haze
     signal = blurred(signal, lighting.blur_px)
@@ -222,9 +220,8 @@ class PlaceRenderer:
         moving_objects = moving_object_surfaces(frame.moving_objects)
         surfaces = self._place.surfaces.joined(moving_objects)
         cam_from_place = self._place.cam_from_place(frame)
-        seen = visible_surfaces(
-            surfaces, cam_from_place, sample_grid(frame.camera, self._supersampling)
-        )
+        grid = sample_grid(frame.camera, self._supersampling)
+        seen = visible_surfaces(surfaces, cam_from_place, grid)
         shadows = None
         if any(frame.lighting.sun):
             shadows = cast_shadows(self._place.surfaces, frame.lighting.sun_direction)

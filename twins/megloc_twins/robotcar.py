@@ -283,10 +283,8 @@ def _colmap_model(frames: Sequence[Frame], points: SparsePoints) -> ColmapModel:
 
 def _write_car(layout: Layout, options: RobotCarTwinOptions) -> None:
     for name, camera in car_cameras(options.size_px).items():
-        lines = [
-            f"{key} {value:f}"
-            for key, value in zip(("fx", "fy", "cx", "cy"), camera.params, strict=True)
-        ]
+        fx, fy, cx, cy = camera.params
+        lines = [f"fx {fx:f}", f"fy {fy:f}", f"cx {cx:f}", f"cy {cy:f}"]
         write_lines(layout.intrinsics(name), lines)
     for name, pose in CAM_FROM_CAR.items():
         rows = [",".join(map(repr, row)) for row in pose.inverse().matrix().tolist()]

@@ -142,15 +142,13 @@ def nvm_model(names: Sequence[str], frames: Sequence[Frame], points: SparsePoint
 def write_nvm(path: Path, model: NvmModel) -> None:
     """Write one model as COLMAP's exporter does: k with NVM's sign, pixels unchanged."""
     points = model.points
-    cameras = np.column_stack(
-        [model.focal_px, model.quat_wxyz, model.centers, 0.0 - model.k_colmap]
-    )
+    columns = model.focal_px, model.quat_wxyz, model.centers, 0.0 - model.k_colmap
     lines = ["NVM_V3 ", " ", f"{len(model.names)}  "]
-    for name, row in zip(model.names, cameras.tolist(), strict=True):
+    for name, row in zip(model.names, np.column_stack(columns).tolist(), strict=True):
         lines.append(f"{name} {' '.join(map(repr, row))} 0")
     lines += ["", str(len(points))]
-    columns = points.image_ids.tolist(), points.feature_ids.tolist(), points.xy_px.astype(str)
-    seen = [f" {image} {feature} {x} {y}" for image, feature, (x, y) in zip(*columns, strict=True)]
+    rows = points.image_ids.tolist(), points.feature_ids.tolist(), points.xy_px.astype(str)
+    seen = [f" {image} {feature} {x} {y}" for image, feature, (x, y) in zip(*rows, strict=True)]
     for xyz, rgb, track in _tracks(points):
         numbers = " ".join(map(repr, (*xyz, *rgb, len(seen[track]))))
         lines.append(numbers + "".join(seen[track]))

@@ -12,15 +12,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import (
-    Condition,
-    Frame,
-    day_lighting,
-    looking_at,
-    night_lighting,
-    noise_seed,
-    reduced,
-)
+from megloc_twins.frames import Frame, day_lighting, looking_at, night_lighting, noise_seed, reduced
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.portable import Bools, Float32, Float64
@@ -135,7 +127,7 @@ def query_frames(
     options: SyntheticWorldOptions,
     place: Place,
     mapping: Sequence[Frame],
-    condition: Condition,
+    condition: str,
     total: int,
 ) -> list[Frame]:
     """Choose the queries of a condition in one place, out of ``total`` in all places."""
@@ -174,9 +166,7 @@ def query_frames(
 
 def views_of(place: Place, frames: Iterable[Frame]) -> list[CoarseView]:
     """Return coarse views of the frames of a place, in the place's coordinates."""
-    return [
-        coarse_view(place.surfaces, frame.camera, place.cam_from_place(frame)) for frame in frames
-    ]
+    return [coarse_view(place.surfaces, f.camera, place.cam_from_place(f)) for f in frames]
 
 
 def query_camera(options: SyntheticWorldOptions, rng: Generator) -> Camera:
