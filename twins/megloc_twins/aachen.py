@@ -117,7 +117,6 @@ class AachenFrames:
 
 
 def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
-    """Choose all images of the twin, deterministically."""
     world = options.world()
     # numbers of the database images, unordered and with gaps
     count = options.num_places * options.stations_per_place * len(_YAWS_DEG)

@@ -6,7 +6,7 @@ dusk, with poses that are withheld as in a challenge. Relocalization files list 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -51,6 +51,9 @@ DUSK = "recording_2021-03-22_18-41-05"
 _FOCAL_PX, _CENTRE_PX = 501.4757919305817, (421.7953735163109, 167.65799492501083)
 _PUBLISHED_SIZE = (800, 400)
 CAM1_FROM_CAM0 = RigidTransform((1.0, 0.0, 0.0, 0.0), (-0.3004961618953472, 0.0, 0.0))
+_CAM_FROM_IMU = RigidTransform(
+    (-0.002350, -0.007202, 0.708623, -0.705546), (0.175412, 0.003689, -0.058106)
+)
 
 _CAMERA_HEIGHT_M = 1.6
 _LOOK_AHEAD_M = 2.0  # the car begins to turn before a corner
@@ -102,7 +105,6 @@ class Drive:
 
 
 def stereo_camera(width: int, height: int) -> Camera:
-    """Return the intrinsics of either camera, PINHOLE."""
     sx, sy = width / _PUBLISHED_SIZE[0], height / _PUBLISHED_SIZE[1]
     params = (_FOCAL_PX * sx, _FOCAL_PX * sx, _CENTRE_PX[0] * sx, _CENTRE_PX[1] * sy)
     return Camera("PINHOLE", width, height, params)
@@ -266,7 +268,6 @@ def _write_recording(
     root: Path, options: FourSeasonsTwinOptions, drive: Drive, moments: list[Moment], work: Work
 ) -> None:
     folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
-    keyframes = [moment for moment in moments if moment.keyframe]
     render_frames(
         options.world(),
         [frame for moment in moments for frame in moment.frames],
@@ -279,12 +280,8 @@ def _write_recording(
     times = (moment.timestamp for moment in moments)  # most have no images
     rows = [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
     write_lines(folder / "times.txt", rows)
-    if drive.name == DUSK:  # poses of test recordings are withheld
-        return
-    slam = SlamFrames.drawn(options.seed, drive.name)
-    write_lines(folder / "GNSSPoses.txt", _gnss_lines(slam, keyframes))
-    blank_lines = drive.name == REFERENCE
-    write_lines(folder / "Transformations.txt", _transformation_lines(slam, blank_lines))
+    if drive.name != DUSK:  # poses of test recordings are withheld
+        _write_slam_world(folder, options.seed, [m for m in moments if m.keyframe])
 
 
 def _write_grey(root: Path, frame: Frame, view: RenderedFrame) -> None:
@@ -292,64 +289,41 @@ def _write_grey(root: Path, frame: Frame, view: RenderedFrame) -> None:
     write_image(root / frame.name, grey)
 
 
-@dataclass(frozen=True)
-class SlamFrames:
-    """Transforms between a recording's coordinate frames, named as in ``Transformations.txt``."""
+def _write_slam_world(folder: Path, seed: int, keyframes: list[Moment]) -> None:
+    """Write the keyframes' poses in a recording's SLAM world, and its transform to ECEF.
 
-    s_from_as: RigidTransform
-    w_from_gpsw: RigidTransform
-    e_from_gpsw: RigidTransform
-    scale: float  # metres per unit of the SLAM world
-
-    @classmethod
-    def drawn(cls, seed: int, recording: str) -> SlamFrames:
-        rng = stream(seed, "frames", recording)
-        # the scenes of different recordings have origins some hundred metres apart
-        east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
-        origin = RigidTransform((1.0, 0.0, 0.0, 0.0), (east, north, up))
-        place = geodetic(np.array((EARTH_FROM_WORLD @ origin).translation))
-        return cls(
-            s_from_as=_as_written(_random_transform(rng, 0.03, 3.2e-2, 0.0)),
-            w_from_gpsw=_as_written(_random_transform(rng, np.pi, 2e-2, 0.4)),
-            e_from_gpsw=_as_written(_settled_earth_from_enu(*place)),
-            scale=round(float(rng.uniform(0.96, 0.97)), 6),
-        )
-
-    def slam_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
-        """Return a pose as in ``GNSSPoses.txt``, translation in units of the SLAM world."""
-        s_from_world = self.w_from_gpsw @ self.e_from_gpsw.inverse() @ EARTH_FROM_WORLD
-        metric = self.s_from_as.inverse() @ s_from_world @ cam_from_world.inverse()
-        x, y, z = (value / self.scale for value in metric.translation)
-        return RigidTransform(metric.quat_wxyz, (x, y, z))
-
-
-def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
-    cam_from_imu = RigidTransform(
-        (-0.002350, -0.007202, 0.708623, -0.705546), (0.175412, 0.003689, -0.058106)
-    )
+    Frames are named as in ``Transformations.txt``.
+    """
+    rng = stream(seed, "frames", folder.name)
+    # the scenes of different recordings have origins some hundred metres apart
+    east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
+    origin = RigidTransform((1.0, 0.0, 0.0, 0.0), (east, north, up))
+    place = geodetic(np.array((EARTH_FROM_WORLD @ origin).translation))
+    s_from_as = _as_written(_random_transform(rng, 0.03, 3.2e-2, 0.0))
+    w_from_gpsw = _as_written(_random_transform(rng, np.pi, 2e-2, 0.4))
+    e_from_gpsw = _as_written(_settled_earth_from_enu(*place))
+    scale = round(float(rng.uniform(0.96, 0.97)), 6)  # metres per unit of the SLAM world
+    as_from_world = s_from_as.inverse() @ (w_from_gpsw @ e_from_gpsw.inverse() @ EARTH_FROM_WORLD)
+    # the header has a column more than the rows, as published
+    columns = "tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, fusion_quality, v3"
+    lines = [f"# timestamp_ns, {columns}"]
+    for moment in keyframes:
+        metric = as_from_world @ moment.cam0_from_world.inverse()
+        x, y, z = (value / scale for value in metric.translation)
+        pose = _pose_fields(RigidTransform(metric.quat_wxyz, (x, y, z)), 12)
+        lines.append(f"{moment.timestamp},{pose},{scale:.6f},2")
+    write_lines(folder / "GNSSPoses.txt", lines)
     lines = []
     for name, transform in (
-        ("transform_S_AS", slam.s_from_as),
-        ("TS_cam_imu", cam_from_imu),
-        ("transform_w_gpsw", slam.w_from_gpsw),
+        ("transform_S_AS", s_from_as),
+        ("TS_cam_imu", _CAM_FROM_IMU),
+        ("transform_w_gpsw", w_from_gpsw),
         ("transform_gps_imu", RigidTransform.identity()),
-        ("transform_e_gpsw", slam.e_from_gpsw),
+        ("transform_e_gpsw", e_from_gpsw),
     ):
-        heading = f"# {name}: translation vector, rotation quaternion"
-        lines += [heading, _pose_fields(transform, 6), *[""] * blank_lines]
-    return [*lines, "# GNSS scale", f"{slam.scale:.6f}"]
-
-
-def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
-    """Format poses below a header, which has a column more than the rows, as published."""
-    lines = [
-        "# timestamp_ns, tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, "
-        "fusion_quality, v3"
-    ]
-    for moment in keyframes:
-        pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), 12)
-        lines.append(f"{moment.timestamp},{pose},{slam.scale:.6f},2")
-    return lines
+        lines += [f"# {name}: translation vector, rotation quaternion", _pose_fields(transform, 6)]
+        lines += [""] * (folder.name == REFERENCE)
+    write_lines(folder / "Transformations.txt", [*lines, "# GNSS scale", f"{scale:.6f}"])
 
 
 def _write_calibration(folder: Path, camera: Camera) -> None:

@@ -89,9 +89,9 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
             for number, zone in enumerate(floor.zones):
                 scan_from_floor = zone.scan_from_place @ floor.place.place_from_world
                 mapping += _cutouts(options, index, number, scan_from_floor)
-                name, after = _transformation(index, number), scan_from_floor.inverse()
-                before = _displaced(after, stream(options.seed, "inloc", "before", name))
-                _write_transformation(root / name, before, after)
+                name = _transformation(index, number)
+                rng = stream(options.seed, "inloc", "before", name)
+                _write_transformation(root / name, scan_from_floor.inverse(), rng)
         for frames, samples in ((mapping, 1), (queries, options.supersampling)):
             render_frames(
                 options.world().model_copy(update={"supersampling": samples}),
@@ -138,26 +138,21 @@ def _cutouts(
     return frames
 
 
-def _displaced(pose: RigidTransform, rng: Generator) -> RigidTransform:
-    """Return a scan's pose before refinement: slightly displaced and rotated."""
+def _write_transformation(path: Path, pose: RigidTransform, rng: Generator) -> None:
+    """Write a scan's pose before refinement, slightly displaced and rotated, and after it."""
     half = 0.5 * float(rng.normal(0, 0.02))
     w, z = settled((np.cos(half), np.sin(half))).tolist()
     turn = RigidTransform((w, 0.0, 0.0, z), (0.0, 0.0, 0.0))
     x, y, z = (float(v) for v in rng.normal(0, 0.08, 3))
-    return RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z)) @ pose @ turn
-
-
-def _write_transformation(path: Path, before: RigidTransform, after: RigidTransform) -> None:
-    """Write both matrices in the published form, each under its heading."""
+    before = RigidTransform((1.0, 0.0, 0.0, 0.0), (x, y, z)) @ pose @ turn
     lines = []
-    for heading, pose in (("Before general icp:", before), ("After general icp:", after)):
-        rows = (" ".join(f"{value:13.9f}" for value in row) for row in pose.matrix())
-        lines += [heading, *rows, ""]
+    for heading, matrix in (("Before", before.matrix()), ("After", pose.matrix())):
+        rows = (" ".join(f"{value:13.9f}" for value in row) for row in matrix)
+        lines += [f"{heading} general icp:", *rows, ""]
     write_lines(path, lines, last_line_ends=False)
 
 
 def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: RenderedFrame) -> None:
-    """Write a frame's image and, for a cutout, the scanned points of its pixels."""
     write_image(root / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
     if frame.sensor_id != "cutout":
         return

@@ -99,7 +99,6 @@ def project(camera: Camera, points: Float64) -> Float64:
 def visible_surfaces(
     surfaces: Surfaces, cam_from_world: RigidTransform, grid: SampleGrid
 ) -> Visibility:
-    """Find the nearest surface along each sample's ray."""
     rotation = cam_from_world.rotation_matrix()
     seen_from = surfaces.moved(rotation, np.array(cam_from_world.translation))
     origin, edge_u, edge_v = seen_from.origin, seen_from.edge_u, seen_from.edge_v

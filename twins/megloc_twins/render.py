@@ -216,7 +216,6 @@ class PlaceRenderer:
         self._clouds = np.clip(0.5 + 0.5 * noise, 0, 1).astype(np.float32)
 
     def render(self, frame: Frame, *, depth: bool = False) -> RenderedFrame:
-        """Render one frame, with its depth if requested."""
         moving_objects = moving_object_surfaces(frame.moving_objects)
         surfaces = self._place.surfaces.joined(moving_objects)
         cam_from_place = self._place.cam_from_place(frame)

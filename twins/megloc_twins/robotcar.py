@@ -175,7 +175,6 @@ def _reference_frames(options: RobotCarTwinOptions, place: Place) -> list[Frame]
 def _query_frames(
     options: RobotCarTwinOptions, place: Place, map_views: list[CoarseView], condition: str
 ) -> list[Frame]:
-    """Choose the moments of a traversal in one location."""
     azimuth = float(stream(options.seed, "robotcar", condition, place.index).uniform(-np.pi, np.pi))
     frames = []
     for number in range(place.index, options.moments_per_condition, options.num_locations):

@@ -41,7 +41,7 @@ def exact_tracks(
     """Create sparse points seen in at least two frames, with exact observations.
 
     Pixels with depth are drawn at random in every frame, lifted to world points and projected into
-    all frames of the same place whose depth agrees. Float32, float32 (H, W) by image name, is 0
+    all frames of the same place whose depth agrees. Depth, (H, W) by image name, is 0
     without a surface. Observations are sorted by point, then image; ``feature_ids`` count from 0 in
     each image.
     """

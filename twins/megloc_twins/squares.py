@@ -219,7 +219,6 @@ class Place:
         return f"place{self.index}"
 
     def cam_from_place(self, frame: Frame) -> RigidTransform:
-        """Return the pose of a frame relative to this place."""
         return frame.cam_from_world @ self.place_from_world.inverse()
 
 
@@ -253,7 +252,6 @@ class _TextureStore:
 
 
 def build_place(options: SyntheticWorldOptions, index: int) -> Place:
-    """Lay out place ``index`` of a world."""
     rng = stream(options.seed, "layout", index)
     plan = draw_floor_plan(rng, index)
     seed, recipes = options.seed, moving_object_recipes(options.seed)

@@ -339,7 +339,6 @@ class TextureRecipe:
     params: tuple[tuple[str, str | float], ...] = ()
 
     def paint(self) -> Rgb:
-        """Paint the texture, uint8 (height, width, 3), RGB."""
         rng = stream(self.seed, self.painter)
         return PAINTERS[self.painter](rng, self.height, self.width, **dict(self.params))
 
