@@ -21,14 +21,8 @@ from megloc_twins.frames import Frame, day_lighting, in_frame, looking_at, noise
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticDataset, TwinOptions, shuffled, stream, write_lines
 from megloc_twins.portable import Float64, settled_pose
-from megloc_twins.sparse_models import (
-    Depths,
-    exact_tracks,
-    nvm_model,
-    render_map_and_queries,
-    write_colmap_model,
-    write_nvm,
-)
+from megloc_twins.render import render_map_and_queries
+from megloc_twins.sparse_models import Depths, as_nvm, exact_tracks, write_colmap_model, write_nvm
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import query_frames
 
@@ -255,7 +249,7 @@ def _write_nvm_model(
     # as if some features observed no point
     points = replace(points, feature_ids=3 * points.feature_ids + 1)
     cameras = {frame.name: frame.camera for frame in frames}
-    write_nvm(folder / "aachen_cvpr2018_db.nvm", nvm_model(list(cameras), frames, points))
+    write_nvm(folder / "aachen_cvpr2018_db.nvm", as_nvm(list(cameras), frames, points))
     path = folder / "database_intrinsics.txt"
     _write_cameras(path, dict(sorted(cameras.items())), last_line_ends=True)
 

@@ -11,29 +11,21 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain
 from operator import itemgetter
+from pathlib import Path
 from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work, ordered_map
 from megloc_kapture.values import RigidTransform
 from megloc_twins.drawing import periodic_noise
 from megloc_twins.frames import Frame, Lighting, Triple
 from megloc_twins.moving_objects import moving_object_surfaces
-from megloc_twins.options import SyntheticWorldOptions, stream
-from megloc_twins.portable import (
-    Bools,
-    Float32,
-    Float64,
-    arctan2,
-    averaged,
-    blurred,
-    exp,
-    product,
-    resized,
-)
+from megloc_twins.options import JPEG_QUALITY, SyntheticWorldOptions, TwinOptions, stream
+from megloc_twins.portable import Float32, arctan2, averaged, blurred, exp, product, resized
 from megloc_twins.rasterization import (
     NO_SURFACE,
     Visibility,
@@ -64,8 +56,8 @@ _CLOUD_SIZE = 512
 class ShadowMap:
     """Largest height along the sun's direction, on a grid of lines parallel to it."""
 
-    axes: Float64  # (3, 3), rows: the grid's x and y directions and the sun's
-    low: Float64  # (2,), the grid's corner
+    axes: NDArray[np.float64]  # (3, 3), rows: the grid's x and y directions and the sun's
+    low: NDArray[np.float64]  # (2,), the grid's corner
     step: float  # grid spacing, metres
     height: Float32  # (_SHADOW_SIZE, _SHADOW_SIZE), metres along the sun's direction
 
@@ -193,7 +185,7 @@ class RenderedFrame:
 
     image: NDArray[np.uint8]  # (H, W, 3), RGB
     depth_m: Float32 | None  # (H, W)
-    mask: Bools  # (H, W), False on the bonnet
+    mask: NDArray[np.bool_]  # (H, W), False on the bonnet
 
 
 def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
@@ -267,15 +259,12 @@ class PlaceRenderer:
             light += of_lamps[..., None] * _rgb(lighting.lamps)
         light += np.take(surfaces.glow, index)[..., None] * _rgb(lighting.glow)
         result = albedo * light
-        sky = seen.surface == NO_SURFACE
-        if sky.any():
-            result[sky] = self._sky(seen, sky, lighting, cam_from_place)
+        result[seen.surface == NO_SURFACE] = self._sky(seen, lighting, cam_from_place)
         return result
 
-    def _sky(
-        self, seen: Visibility, where: Bools, lighting: Lighting, cam_from_place: RigidTransform
-    ) -> Float32:
+    def _sky(self, seen: Visibility, lighting: Lighting, cam_from_place: RigidTransform) -> Float32:
         rotation = cam_from_place.rotation_matrix().astype(np.float32)
+        where = seen.surface == NO_SURFACE
         gx = np.broadcast_to(seen.grid.x, where.shape)[where].astype(np.float32)
         gy = np.broadcast_to(seen.grid.y, where.shape)[where].astype(np.float32)
         rays = gx[:, None] * rotation[0] + gy[:, None] * rotation[1] + rotation[2]
@@ -367,3 +356,17 @@ def _render(
         (frame.name, finish(frame, renderer.render(frame, depth=frame.name in with_depth)))
         for frame in frames
     ]
+
+
+def render_map_and_queries(
+    options: TwinOptions, mapping: list[Frame], others: list[Frame], images: Path, work: Work
+) -> dict[str, Float32]:
+    """Render all frames, write them by name below ``images`` and return the map images' depths."""
+    names, finish = [frame.name for frame in mapping], partial(_write, images)
+    drawn = render_frames(options.world(), mapping + others, finish, with_depth=names, work=work)
+    return {name: depth for name, depth in drawn.items() if depth is not None}
+
+
+def _write(images: Path, frame: Frame, view: RenderedFrame) -> Float32 | None:
+    write_image(images / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
+    return view.depth_m

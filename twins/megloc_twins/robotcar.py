@@ -38,14 +38,8 @@ from megloc_twins.options import (
     write_lines,
 )
 from megloc_twins.portable import Float64, settled_pose
-from megloc_twins.sparse_models import (
-    Depths,
-    exact_tracks,
-    nvm_model,
-    render_map_and_queries,
-    write_colmap_model,
-    write_nvm,
-)
+from megloc_twins.render import render_map_and_queries
+from megloc_twins.sparse_models import Depths, as_nvm, exact_tracks, write_colmap_model, write_nvm
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit, views_of
 
@@ -262,7 +256,7 @@ def _write_models(
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))
     names = [f"./{_png(frame.name)}" for frame in frames]
-    write_nvm(layout.merged_model, nvm_model(names, frames, SparsePoints.joined(parts)))
+    write_nvm(layout.merged_model, as_nvm(names, frames, SparsePoints.joined(parts)))
 
 
 def _colmap_model(frames: Sequence[Frame], points: SparsePoints) -> ColmapModel:

@@ -7,7 +7,7 @@ the model is as exact as float32 pixels allow.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,11 @@ from numpy.random import Generator
 from megloc_kapture.datasets.nvm import NvmModel
 from megloc_kapture.io.colmap import load_pycolmap, new_colmap_camera, new_colmap_pose
 from megloc_kapture.io.colmap_model import ColmapModel, SparsePoints
-from megloc_kapture.io.images import write_image
-from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 from megloc_twins.frames import Frame
-from megloc_twins.options import JPEG_QUALITY, TwinOptions, write_lines
+from megloc_twins.options import write_lines
 from megloc_twins.portable import Bools, Float32, Float64
 from megloc_twins.rasterization import intrinsics, project, sample_grid
-from megloc_twins.render import RenderedFrame, render_frames
 
 _BORDER_PX = 2.0  # smallest distance of a feature from the image border
 # tolerated difference of a point's depth from its pixel's, relative plus absolute; slanted
@@ -106,27 +103,7 @@ def _squared_reach(camera: Camera) -> float:
     return float((grid.x**2 + grid.y**2).max())
 
 
-def render_map_and_queries(
-    options: TwinOptions,
-    mapping: Sequence[Frame],
-    others: Sequence[Frame],
-    images: Path,
-    work: Work,
-) -> Depths:
-    """Render all frames, write them by name below ``images`` and return the map images' depths."""
-    names = [frame.name for frame in mapping]
-    frames = [*mapping, *others]
-    finish = partial(_write, images)
-    drawn = render_frames(options.world(), frames, finish, with_depth=names, work=work)
-    return {name: depth for name, depth in drawn.items() if depth is not None}
-
-
-def _write(images: Path, frame: Frame, view: RenderedFrame) -> Float32 | None:
-    write_image(images / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
-    return view.depth_m
-
-
-def nvm_model(names: Sequence[str], frames: Sequence[Frame], points: SparsePoints) -> NvmModel:
+def as_nvm(names: Sequence[str], frames: Sequence[Frame], points: SparsePoints) -> NvmModel:
     """Return the frames as images of an NVM file, under the given names."""
     lenses = np.array([intrinsics(frame.camera) for frame in frames])
     return NvmModel(
