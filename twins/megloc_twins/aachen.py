@@ -6,7 +6,7 @@ converted to the published one when written.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -114,8 +114,8 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
     world = options.world()
     # numbers of the database images, unordered and with gaps
     count = options.num_places * options.stations_per_place * len(_YAWS_DEG)
-    numbers = stream(options.seed, "aachen", "numbers").permutation(2 * count + 50) + 1
-    numbers = numbers[numbers != _WRONG_IMAGE][:count].tolist()
+    drawn = stream(options.seed, "aachen", "numbers").permutation(2 * count + 50) + 1
+    numbers = iter(drawn[drawn != _WRONG_IMAGE].tolist())
     database: list[Frame] = []
     sequences: list[Frame] = []
     day: list[Frame] = []
@@ -124,7 +124,7 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
     num_night = num_v1_0 + options.additional_night_queries
     for index in range(options.num_places):
         place = build_place(world, index)
-        album = _photographs(options, place, numbers[len(database) :])
+        album = list(_photographs(options, place, numbers))
         database += album
         sequences += _sequence(options, place)
         day += query_frames(world, place, album, "day", num_day + NUM_UNLISTED)
@@ -140,26 +140,26 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
     )
 
 
-def _photographs(options: AachenTwinOptions, place: Place, numbers: list[int]) -> list[Frame]:
-    """Return a place's map images, each with a separate camera, taken on two sunny days."""
+def _photographs(
+    options: AachenTwinOptions, place: Place, numbers: Iterator[int]
+) -> Iterator[Frame]:
+    """Yield a place's map images, each with a separate camera, taken on two sunny days."""
     rng = stream(options.seed, "aachen", "database", place.index)
     suns = [(rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(40, 60))) for _ in range(2)]
-    frames: list[Frame] = []
     for station, (spot, heading) in enumerate(place.plan.stops(options.stations_per_place)):
         # photographs of a day are consecutive, so that its shadow map is computed once
         sun = suns[2 * station // options.stations_per_place]
         for yaw_deg in _YAWS_DEG:
-            number = numbers[len(frames)]
+            number = next(numbers)
             at = np.array([*spot + rng.normal(0, 0.15, 2), rng.uniform(1.5, 1.9)])
             yaw = heading + np.radians(yaw_deg) + float(rng.normal(0, 0.1))
             camera = _photo_camera(options, rng)
             names = f"db/{number}.jpg", f"db_{number}"
-            frames.append(_map_frame(options, place, names, camera, at, yaw, sun, rng))
-    return frames
+            yield _map_frame(options, place, names, camera, at, yaw, sun, rng)
 
 
-def _sequence(options: AachenTwinOptions, place: Place) -> list[Frame]:
-    """Return a sequence: a few images along the path of a place, by one camera facing left."""
+def _sequence(options: AachenTwinOptions, place: Place) -> Iterator[Frame]:
+    """Yield a sequence: a few images along the path of a place, by one camera facing left."""
     rng = stream(options.seed, "aachen", "sequence", place.index)
     sun = (float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60))))
     width, height = options.width, options.height
@@ -172,13 +172,11 @@ def _sequence(options: AachenTwinOptions, place: Place) -> list[Frame]:
         camera = _photo_camera(options, rng, portraits=False)
     # steps of half the distance between the spots of the photographs
     steps = place.plan.stops(max(2 * options.stations_per_place, options.sequence_images))
-    frames = []
     for step, (spot, heading) in enumerate(steps[: options.sequence_images]):
         at = np.array([*spot, 1.6 + rng.normal(0, 0.02)])
         yaw = heading + np.pi / 2 + float(rng.normal(0, 0.05))
         names = f"{folder}/{file.format(30 * step + 1)}", folder
-        frames.append(_map_frame(options, place, names, camera, at, yaw, sun, rng))
-    return frames
+        yield _map_frame(options, place, names, camera, at, yaw, sun, rng)
 
 
 def _map_frame(

@@ -6,7 +6,7 @@ dusk, with poses that are withheld as in a challenge. Relocalization files list 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -140,7 +140,7 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         options, drives = self.options, self.options.drives()
-        driven = {drive.name: drive_moments(options.world(), drive) for drive in drives}
+        driven = {drive.name: list(drive_moments(options.world(), drive)) for drive in drives}
         keyframes = {name: [m for m in moments if m.keyframe] for name, moments in driven.items()}
         _write_calibration(root / "calibration", stereo_camera(options.width, options.height))
         for drive in drives:
@@ -157,10 +157,9 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
         return {"places": options.num_places} | write_truth(root, *truth)
 
 
-def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
-    """Return the moments of a drive through all places, in order of time."""
+def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> Iterator[Moment]:
+    """Yield the moments of a drive through all places, in order of time."""
     rng = stream(options.seed, "drive", drive.name)
-    moments = []
     start = datetime.strptime(drive.name, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
     clock = int(start.timestamp()) * 10**9
     for index in range(options.num_places):
@@ -182,10 +181,10 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
                 pose = cam_from_place @ place.place_from_world
                 frames: tuple[Frame, ...] = ()
                 if step == 0 or (step == 1 and stop % _EXTRA_EVERY == 1):
-                    frames = _frames(options, drive, place, timestamp, pose, position, sun, rng)
-                moments.append(Moment(timestamp, pose, step == 0, frames))
+                    images = _frames(options, drive, place, timestamp, pose, position, sun, rng)
+                    frames = tuple(images)
+                yield Moment(timestamp, pose, step == 0, frames)
         clock += 20_000_000_000  # the drive to the next place is not recorded
-    return moments
 
 
 def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
@@ -221,29 +220,25 @@ def _frames(
     position: Float64,
     sun: tuple[float, float],
     rng: Generator,
-) -> tuple[Frame, ...]:
+) -> Iterator[Frame]:
     moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
     lighting = _lighting(drive.name, rng, sun)
     poses = {"cam0": cam0_from_world, "cam1": CAM1_FROM_CAM0 @ cam0_from_world}
-    frames = []
     for sensor_id, pose in poses.items():
         name = f"{drive.name}/undistorted_images/{sensor_id}/{timestamp}.png"
-        frames.append(
-            Frame(
-                name=name,
-                condition=drive.name,
-                place=place.index,
-                timestamp=timestamp,
-                sensor_id=sensor_id,
-                camera=stereo_camera(options.width, options.height),
-                cam_from_world=pose,
-                lighting=lighting,
-                noise_seed=noise_seed(options.seed, name),
-                moving_objects=moving_objects,
-                bonnet=True,
-            )
+        yield Frame(
+            name=name,
+            condition=drive.name,
+            place=place.index,
+            timestamp=timestamp,
+            sensor_id=sensor_id,
+            camera=stereo_camera(options.width, options.height),
+            cam_from_world=pose,
+            lighting=lighting,
+            noise_seed=noise_seed(options.seed, name),
+            moving_objects=moving_objects,
+            bonnet=True,
         )
-    return tuple(frames)
 
 
 def _free_offset(plan: FloorPlan, along: float, most: float, rng: Generator) -> float:

@@ -84,7 +84,8 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         root, options = Path(root), self.options
-        mapping, queries = [], build_queries(options)
+        mapping: list[Frame] = []
+        queries = list(build_queries(options))
         for index, floor in enumerate(options.floors()):
             for number, zone in enumerate(floor.zones):
                 scan_from_floor = zone.scan_from_place @ floor.place.place_from_world
@@ -113,29 +114,25 @@ def _transformation(floor: int, number: int) -> str:
 
 def _cutouts(
     options: InLocTwinOptions, floor: int, number: int, scan_from_floor: RigidTransform
-) -> list[Frame]:
-    frames: list[Frame] = []
+) -> Iterator[Frame]:
     camera = cutout_camera(options.cutout_width, options.cutout_height)
     folder = f"database/cutouts/{_FLOORS[floor]}/{number:03d}"
     # a panorama has a single exposure
     rng = stream(options.seed, "inloc", "light", _transformation(floor, number))
     lighting = lamp_lighting(rng, noise=1.0)
-    for yaw, pitch in itertools.product(YAWS_DEG, PITCHES_DEG):
+    for view, (yaw, pitch) in enumerate(itertools.product(YAWS_DEG, PITCHES_DEG)):
         name = f"{folder}/{_BUILDING}_cutout_{number:03d}_{yaw}_{pitch}.jpg"
-        frames.append(
-            Frame(
-                name=name,
-                condition=_FLOORS[floor],
-                place=floor,
-                timestamp=len(frames) + 1000 * number + 1_000_000 * floor,
-                sensor_id="cutout",
-                camera=camera,
-                cam_from_world=cam_from_scan(yaw, pitch) @ scan_from_floor,
-                lighting=lighting,
-                noise_seed=noise_seed(options.seed, name),
-            )
+        yield Frame(
+            name=name,
+            condition=_FLOORS[floor],
+            place=floor,
+            timestamp=view + 1000 * number + 1_000_000 * floor,
+            sensor_id="cutout",
+            camera=camera,
+            cam_from_world=cam_from_scan(yaw, pitch) @ scan_from_floor,
+            lighting=lighting,
+            noise_seed=noise_seed(options.seed, name),
         )
-    return frames
 
 
 def _write_transformation(path: Path, pose: RigidTransform, rng: Generator) -> None:
@@ -214,8 +211,8 @@ def phone_camera(width: int, height: int) -> Camera:
     return Camera.pinhole(width, height, max(width, height) * 28 / 36)
 
 
-def build_queries(options: InLocTwinOptions) -> list[Frame]:
-    """Choose phone images, floor by floor and zone by zone; a third of them in portrait format.
+def build_queries(options: InLocTwinOptions) -> Iterator[Frame]:
+    """Yield phone images, floor by floor and zone by zone; a third of them in portrait format.
 
     A query gets the first of some hundred random poses whose view is covered well by the floor's
     scans, and better than the corresponding view is by scans of similar rooms; else the pose that
@@ -224,7 +221,6 @@ def build_queries(options: InLocTwinOptions) -> list[Frame]:
     floors = options.floors()
     scans = [[_scan_views(floor, zone) for zone in floor.zones] for floor in floors]
     size = options.query_width, options.query_height
-    frames: list[Frame] = []
     for index, floor in enumerate(floors):
         first, last = (options.queries * number // len(floors) for number in (index, index + 1))
         for position in range(last - first):
@@ -233,23 +229,20 @@ def build_queries(options: InLocTwinOptions) -> list[Frame]:
             upright = (position + position // len(floor.zones)) % 3 == 2
             camera = phone_camera(*(size[::-1] if upright else size))
             pose, yaw = first_fitting(_query_poses(floors, index, zone, camera, scans, rng))
-            name = f"query/iphone7/IMG_{_FIRST_QUERY + len(frames):04d}.JPG"
+            name = f"query/iphone7/IMG_{_FIRST_QUERY + first + position:04d}.JPG"
             light = stream(options.seed, "inloc", "light", name)
-            frames.append(
-                Frame(
-                    name=name,
-                    condition=_FLOORS[index],
-                    place=index,
-                    timestamp=len(frames),
-                    sensor_id="upright" if camera.height > camera.width else "iphone7",
-                    camera=camera,
-                    cam_from_world=pose @ floor.place.place_from_world,
-                    lighting=lamp_lighting(light, noise=3.0, spread=0.15),
-                    noise_seed=noise_seed(options.seed, name),
-                    moving_objects=_people(zone, pose, yaw, rng),
-                )
+            yield Frame(
+                name=name,
+                condition=_FLOORS[index],
+                place=index,
+                timestamp=first + position,
+                sensor_id="upright" if camera.height > camera.width else "iphone7",
+                camera=camera,
+                cam_from_world=pose @ floor.place.place_from_world,
+                lighting=lamp_lighting(light, noise=3.0, spread=0.15),
+                noise_seed=noise_seed(options.seed, name),
+                moving_objects=_people(zone, pose, yaw, rng),
             )
-    return frames
 
 
 def _query_poses(

@@ -137,7 +137,7 @@ def build_robotcar_frames(options: RobotCarTwinOptions) -> tuple[list[Frame], li
     queries: list[Frame] = []
     for index in range(options.num_locations):
         place = build_place(options.world(), index)
-        here = _reference_frames(options, place)
+        here = list(_reference_frames(options, place))
         views = views_of(place, here)
         for condition in CONDITIONS:
             queries += _query_frames(options, place, views, condition)
@@ -156,26 +156,22 @@ def car_cameras(size_px: int) -> dict[str, Camera]:
     return cameras
 
 
-def _reference_frames(options: RobotCarTwinOptions, place: Place) -> list[Frame]:
+def _reference_frames(options: RobotCarTwinOptions, place: Place) -> Iterator[Frame]:
     rng = stream(options.seed, "robotcar", REFERENCE_CONDITION, place.index)
     azimuth = float(rng.uniform(-np.pi, np.pi))
-    frames = []
     for number, (spot, heading) in enumerate(place.plan.stops(options.stops_per_location)):
         pose = _car_from_place(spot + rng.normal(0, 0.15, 2), heading + rng.normal(0, 0.1), rng)
-        frames += _moment(options, place, REFERENCE_CONDITION, number, pose, azimuth, rng)
-    return frames
+        yield from _moment(options, place, REFERENCE_CONDITION, number, pose, azimuth, rng)
 
 
 def _query_frames(
     options: RobotCarTwinOptions, place: Place, map_views: list[CoarseView], condition: str
-) -> list[Frame]:
+) -> Iterator[Frame]:
     azimuth = float(stream(options.seed, "robotcar", condition, place.index).uniform(-np.pi, np.pi))
-    frames = []
     for number in range(place.index, options.moments_per_condition, options.num_locations):
         rng = stream(options.seed, "robotcar", condition, place.index, number)
         pose = first_fitting(_query_poses(options, place, map_views, rng))
-        frames += _moment(options, place, condition, number, pose, azimuth, rng)
-    return frames
+        yield from _moment(options, place, condition, number, pose, azimuth, rng)
 
 
 def _moment(
@@ -186,34 +182,30 @@ def _moment(
     car_from_place: RigidTransform,
     azimuth: float,
     rng: Generator,
-) -> list[Frame]:
-    """Return the three cameras' frames at a moment of a traversal, in the order of CAMERAS."""
+) -> Iterator[Frame]:
+    """Yield the three cameras' frames at a moment of a traversal, in the order of CAMERAS."""
     jitter = int(rng.integers(0, 1000))
     timestamp = _STARTS_US[condition] + place.index * _PLACE_US + number * _STOP_US + jitter
     car_from_world = car_from_place @ place.place_from_world
     moving_objects = place_moving_objects(
         place.plan, rng, options.world().moving_objects, car_from_place.center()
     )
-    frames = []
     for camera, intrinsics in car_cameras(options.size_px).items():
         name = f"{condition}/{camera}/{timestamp}.jpg"
         lighting = road_lighting(condition, rng, azimuth=azimuth)
-        frames.append(
-            Frame(
-                name=name,
-                condition=condition,
-                place=place.index,
-                timestamp=timestamp,
-                sensor_id=camera,
-                camera=intrinsics,
-                cam_from_world=CAM_FROM_CAR[camera] @ car_from_world,
-                lighting=lighting,
-                noise_seed=noise_seed(options.seed, name),
-                moving_objects=moving_objects,
-                bonnet=camera == SCORED_CAMERA,
-            )
+        yield Frame(
+            name=name,
+            condition=condition,
+            place=place.index,
+            timestamp=timestamp,
+            sensor_id=camera,
+            camera=intrinsics,
+            cam_from_world=CAM_FROM_CAR[camera] @ car_from_world,
+            lighting=lighting,
+            noise_seed=noise_seed(options.seed, name),
+            moving_objects=moving_objects,
+            bonnet=camera == SCORED_CAMERA,
         )
-    return frames
 
 
 def _query_poses(

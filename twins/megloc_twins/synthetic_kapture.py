@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
@@ -62,11 +63,10 @@ def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
 
 def _mapping_frames(
     options: SyntheticWorldOptions, place: Place, rig_from_world: dict[int, RigidTransform]
-) -> list[Frame]:
-    """Return the rig's frames in a place by time; add the rig's poses to ``rig_from_world``."""
+) -> Iterator[Frame]:
+    """Yield the rig's frames in a place by time; add the rig's poses to ``rig_from_world``."""
     rng = stream(options.seed, "mapping", place.index)
     sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60)))
-    frames = []
     for station, (spot, heading) in enumerate(place.plan.stops(options.stations_per_place)):
         timestamp = 1000 * (place.index + 1) + station
         position = np.array([*spot + rng.normal(0, 0.15, 2), RIG_HEIGHT_M + rng.normal(0, 0.03)])
@@ -78,22 +78,19 @@ def _mapping_frames(
         for sensor_id, camera in rig_cameras(options).items():
             folder = sensor_id.removeprefix("rig_")
             image = f"db/{place.name}/{folder}/{station:05d}.jpg"
-            frames.append(
-                Frame(
-                    name=image,
-                    condition="day",
-                    place=place.index,
-                    timestamp=timestamp,
-                    sensor_id=sensor_id,
-                    camera=camera,
-                    cam_from_world=SENSOR_FROM_RIG[sensor_id] @ pose,
-                    lighting=day_lighting(rng, sun, overcast=0.15),
-                    noise_seed=noise_seed(options.seed, image),
-                    moving_objects=moving_objects,
-                    bonnet=sensor_id == "rig_front",
-                )
+            yield Frame(
+                name=image,
+                condition="day",
+                place=place.index,
+                timestamp=timestamp,
+                sensor_id=sensor_id,
+                camera=camera,
+                cam_from_world=SENSOR_FROM_RIG[sensor_id] @ pose,
+                lighting=day_lighting(rng, sun, overcast=0.15),
+                noise_seed=noise_seed(options.seed, image),
+                moving_objects=moving_objects,
+                bonnet=sensor_id == "rig_front",
             )
-    return frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +114,7 @@ def build_world(options: SyntheticWorldOptions) -> SyntheticWorld:
     mapping: list[Frame] = []
     queries: list[Frame] = []
     for place in places:
-        seen = _mapping_frames(options, place, rig_from_world)
+        seen = list(_mapping_frames(options, place, rig_from_world))
         queries += query_frames(options, place, seen, "day", options.day_queries)
         queries += query_frames(options, place, seen, "night", options.night_queries)
         mapping += seen

@@ -129,10 +129,9 @@ def query_frames(
     mapping: Sequence[Frame],
     condition: str,
     total: int,
-) -> list[Frame]:
-    """Choose the queries of a condition in one place, out of ``total`` in all places."""
+) -> Iterator[Frame]:
+    """Yield the queries of a condition in one place, out of ``total`` in all places."""
     map_views = views_of(place, mapping)
-    frames = []
     for number in range(place.index, total, options.num_places):
         sensor_id = f"{condition}_{number:05d}"
         image = f"query/{condition}/{number:05d}.jpg"
@@ -145,23 +144,20 @@ def query_frames(
         else:
             sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(35, 60)))
             lighting = day_lighting(rng, sun, overcast=float(rng.choice([0.1, 0.5, 1.0])))
-        frames.append(
-            Frame(
-                name=image,
-                condition=condition,
-                place=place.index,
-                timestamp=(100_000 if condition == "day" else 200_000) + number,
-                sensor_id=sensor_id,
-                camera=camera,
-                cam_from_world=cam_from_place @ place.place_from_world,
-                lighting=lighting,
-                noise_seed=noise_seed(options.seed, image),
-                moving_objects=place_moving_objects(
-                    place.plan, rng, options.moving_objects, position, yaw
-                ),
-            )
+        yield Frame(
+            name=image,
+            condition=condition,
+            place=place.index,
+            timestamp=(100_000 if condition == "day" else 200_000) + number,
+            sensor_id=sensor_id,
+            camera=camera,
+            cam_from_world=cam_from_place @ place.place_from_world,
+            lighting=lighting,
+            noise_seed=noise_seed(options.seed, image),
+            moving_objects=place_moving_objects(
+                place.plan, rng, options.moving_objects, position, yaw
+            ),
         )
-    return frames
 
 
 def views_of(place: Place, frames: Iterable[Frame]) -> list[CoarseView]:
