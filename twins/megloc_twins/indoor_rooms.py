@@ -91,8 +91,7 @@ class Parts:
 
     def wall(self, start: Point, end: Point, texture: int, trim: int) -> Wall:
         """Return the wall from ``start`` (left, seen from the front) to ``end``."""
-        ends = np.array(start), np.array(end)
-        return Wall.between(self.shared, ends, texture, trim, _HEIGHT_M)
+        return Wall(self.shared, (start, end), texture, trim, _HEIGHT_M)
 
     def lamp(self, x: float, y: float) -> None:
         glow, plain = self.recipes.thing("glow", "lamp"), self.recipes.thing("plain", "lamp")

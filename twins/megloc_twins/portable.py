@@ -8,7 +8,6 @@ elementary functions are computed in float64 and rounded.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -35,9 +34,8 @@ def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
     """Return the transform of a rotation (3, 3) and a translation (3,), rounded."""
     quat = settled(RigidTransform.from_matrix(rotation, translation).quat_wxyz)
     # rounding errors of w decide the quaternion's sign for rotations by 180 degrees
-    w, x, y, z = (quat * np.sign(quat[np.flatnonzero(quat)[0]]) + 0.0).tolist()
-    length = math.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w / length, x / length, y / length, z / length
+    quat = quat * np.sign(quat[np.flatnonzero(quat)[0]])
+    w, x, y, z = (quat / np.sqrt((quat * quat).sum()) + 0.0).tolist()
     tx, ty, tz = settled(translation).tolist()
     return RigidTransform((w, x, y, z), (tx, ty, tz))
 

@@ -265,7 +265,7 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
         material = _MATERIALS[int(rng.integers(len(_MATERIALS)))]
         texture = store.material("wall", material, size_m, f"wall{number}")
         trim = store.pick("plain")
-        wall = Wall.between(builder, (start, end), texture, trim, _WALL_HEIGHT_M)
+        wall = Wall(builder, (start, end), texture, trim, _WALL_HEIGHT_M)
         lamps += Facade(wall, rng, store.pick).build()
     low, high = plan.outline.min(0) - 0.5, plan.outline.max(0) + 0.5
     width, depth = (high - low).tolist()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from megloc_twins.portable import Float64, product, settled
 
@@ -145,35 +145,22 @@ class Opening:
     glow: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Wall:
-    """A wall from ``start`` to the right, seen from inside; its parts are added to ``builder``."""
+    """A wall; its parts are added to ``builder``."""
 
     builder: SurfaceBuilder
-    start: Float64  # (3,), lower left corner, metres
-    right: Float64  # (3,), unit vector
-    inward: Float64  # (3,), unit vector towards the viewer
-    length: float  # metres
+    ends: tuple[ArrayLike, ArrayLike]  # left and right, seen from inside, (2,) each, metres
     texture: int  # of the wall itself, stretched over its length and height
     trim: int  # texture of ledges, reveals and pilasters
     height: float  # metres
 
-    @classmethod
-    def between(
-        cls,
-        builder: SurfaceBuilder,
-        ends: tuple[Float64, Float64],
-        texture: int,
-        trim: int,
-        height: float,
-    ) -> Wall:
-        """Return the wall between two ends, left and right, (2,) each, metres."""
-        start, end = ends
-        length = float(np.hypot(*(end - start)))
-        right = np.array([*(end - start) / length, 0.0])
-        inward = np.array([right[1], -right[0], 0.0])
-        start = np.array([*start, 0.0])
-        return cls(builder, start, right, inward, length, texture, trim, height)
+    def __post_init__(self) -> None:
+        start, end = np.asarray(self.ends)
+        self.length = float(np.hypot(*(end - start)))
+        self.start = np.array([*start, 0.0])  # the lower left corner
+        self.right = np.array([*(end - start) / self.length, 0.0])  # unit vector
+        self.inward = np.array([self.right[1], -self.right[0], 0.0])  # towards the viewer
 
     def point(self, x: float, y: float, out: float = 0.0) -> Float64:
         """Return the point at ``x`` along, ``y`` above the foot and ``out`` of the wall, metres."""
