@@ -1,8 +1,4 @@
-"""A rendered twin of Aachen Day-Night: photographs of many people, sequences, phone queries.
-
-Frames have the names of the official layout. Their poses are in the rendered world's frame and
-converted to the published one when written.
-"""
+"""A rendered twin of Aachen Day-Night: photographs of many people, sequences, phone queries."""
 
 from __future__ import annotations
 
@@ -95,11 +91,11 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
 
 @dataclass(frozen=True, eq=False)
 class AachenFrames:
-    """All images of the twin, queries in the order of the lists, with poses in the world."""
+    """All images with their official names, and with poses in the rendered world."""
 
     database: list[Frame]  # map images with separate cameras, in the order of the NVM
     sequences: list[Frame]  # map images, with one sensor per sequence
-    day: list[Frame]
+    day: list[Frame]  # queries in the order of the lists
     night: list[Frame]  # queries of v1.0, then those added by v1.1
     unlisted: list[Frame]  # below ``query/``, but in no list
 

@@ -83,15 +83,10 @@ EARTH_FROM_WORLD = _settled_earth_from_enu(48.1861, 11.6197, 540.0)
 
 @dataclass(frozen=True)
 class Moment:
-    """The car at a ``timestamp`` in nanoseconds, which may be a keyframe of the odometry.
-
-    ``frames`` are the images of both cameras; empty if the recording has none of this moment.
-    """
-
-    timestamp: int
+    timestamp: int  # nanoseconds
     cam0_from_world: RigidTransform
-    keyframe: bool
-    frames: tuple[Frame, ...]
+    keyframe: bool  # of the odometry
+    frames: tuple[Frame, ...]  # of both cameras; most moments have none
 
 
 @dataclass(frozen=True)

@@ -50,10 +50,8 @@ def _triple(values: Float64) -> Triple:
 def day_lighting(rng: Generator, sun: tuple[float, float], *, overcast: float) -> Lighting:
     """Return daylight; exposure and white balance vary a little from image to image.
 
-    Parameters
-    ----------
-    sun : azimuth and elevation, radians, in the place's frame.
-    overcast : 0..1, attenuation of the sun by clouds.
+    ``sun`` is its azimuth and elevation, radians, in the place's frame, ``overcast`` (0..1) its
+    attenuation by clouds.
     """
     azimuth, elevation = sun
     cos = np.cos(elevation)
@@ -131,10 +129,7 @@ WEATHERS: dict[str, Weather] = {
 
 
 def road_lighting(condition: str, rng: Generator, *, azimuth: float) -> Lighting:
-    """Return the lighting of an image of a traversal in one of the WEATHERS.
-
-    ``azimuth`` is that of the sun, radians, in the place's frame.
-    """
+    """Return the lighting in one of the WEATHERS; the sun's ``azimuth`` is in the place's frame."""
     weather = WEATHERS[condition]
     if weather.elevation_deg is None:
         lighting = night_lighting(rng)

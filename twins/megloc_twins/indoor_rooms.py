@@ -154,16 +154,11 @@ class Parts:
 
 @dataclass(frozen=True)
 class _RoomKind:
-    """Walls and windows of a kind of room.
-
-    ``materials`` and ``posters`` (positions of individual posters) are for the walls opposite the
-    door, to its right, of the door and to its left. ``windows``: left edges, width, lower and upper
-    edge above the floor.
-    """
-
+    # walls: opposite the door, to its right, of the door and to its left
     materials: tuple[str, str, str, str]
+    # left edges, width, lower and upper edge above the floor
     windows: tuple[tuple[float, ...], float, float, float]
-    posters: tuple[tuple[Point, ...], ...]
+    posters: tuple[tuple[Point, ...], ...]  # positions of individual posters on each wall
     cupboard: Point
 
 

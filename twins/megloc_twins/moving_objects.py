@@ -53,14 +53,10 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """Plan of a place in its frame, metres.
+    """Plan of a place in its frame, metres."""
 
-    ``outline``, float64 (N, 2), is the counter-clockwise base line of the walls; ``path``, float64
-    (M, 2), is the closed path of the mapping rig.
-    """
-
-    outline: Float64
-    path: Float64
+    outline: Float64  # (N, 2), counter-clockwise base line of the walls
+    path: Float64  # (M, 2), closed path of the mapping rig
     obstacles: tuple[Obstacle, ...] = ()
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
@@ -107,13 +103,10 @@ def _distance_inside(x: float, y: float, ring: Float64) -> float:
 
 @dataclass(frozen=True)
 class MovingObject:
-    """A person or car at one moment: x, y (metres) and yaw (radians) in the place's frame.
-
-    ``variant`` numbers the textures of a kind from 0.
-    """
+    """A person or car at one moment: x, y (metres) and yaw (radians) in the place's frame."""
 
     kind: Kind
-    variant: int
+    variant: int  # number of the kind's texture, from 0
     position: tuple[float, float]
     yaw: float
 

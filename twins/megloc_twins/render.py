@@ -121,8 +121,7 @@ def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDAr
     ``seed`` determines the bonnet's dirt, if the frame shows a bonnet.
     """
     lighting, width, height = frame.lighting, frame.camera.width, frame.camera.height
-    if supersampling > 1:
-        light = averaged(light, supersampling)
+    light = averaged(light, supersampling)
     if frame.bonnet:
         cover, paint = bonnet(width, height, seed)
         lit = _rgb(lighting.sky) + np.float32(0.4) * _rgb(lighting.sun)
@@ -177,14 +176,10 @@ def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """A rendered frame.
-
-    ``depth_m`` is None unless requested: depth along the optical axis at pixel centres, including
-    moving objects, 0 without a surface or behind the bonnet.
-    """
-
     image: NDArray[np.uint8]  # (H, W, 3), RGB
-    depth_m: Float32 | None  # (H, W)
+    # (H, W), along the optical axis at pixel centres, 0 without a surface or behind the bonnet;
+    # None unless requested
+    depth_m: Float32 | None
     mask: NDArray[np.bool_]  # (H, W), False on the bonnet
 
 
@@ -220,9 +215,8 @@ class PlaceRenderer:
         light = self._radiance(seen, surfaces, frame.lighting, cam_from_place, shadows)
         image = develop(light, frame, self._supersampling, self._seed)
         width, height = frame.camera.width, frame.camera.height
-        mask = np.ones((height, width), bool)
-        if frame.bonnet:
-            mask = bonnet(width, height, self._seed)[0] < _BONNET_COVERS
+        cover = bonnet(width, height, self._seed)[0] if frame.bonnet else np.zeros((height, width))
+        mask = cover < _BONNET_COVERS
         depth_m = None
         if depth:
             if self._supersampling > 1:
@@ -246,16 +240,14 @@ class PlaceRenderer:
         normals = surfaces.normals()
         ambient = 0.62 + 0.38 * normals[:, 2]
         light = np.take(ambient.astype(np.float32), index)[..., None] * _rgb(lighting.sky)
-        lamps = self._place.lamps if any(lighting.lamps) else ()
-        if shadows is not None or len(lamps):
-            x, y, z = _positions(seen, cam_from_place)
+        x, y, z = _positions(seen, cam_from_place)
         if shadows is not None:
             facing = np.clip(product(normals, np.array(lighting.sun_direction)), 0, None)
             sun = np.take(facing.astype(np.float32), index) * shadows.lit(x, y, z)
             light += sun[..., None] * _rgb(lighting.sun)
-        if len(lamps):
+        if any(lighting.lamps):
             normal = np.take(normals.astype(np.float32), index, axis=0)
-            of_lamps = _lamp_light((x, y, z), normal, np.asarray(lamps, np.float32))
+            of_lamps = _lamp_light((x, y, z), normal, self._place.lamps.astype(np.float32))
             light += of_lamps[..., None] * _rgb(lighting.lamps)
         light += np.take(surfaces.glow, index)[..., None] * _rgb(lighting.glow)
         result = albedo * light
@@ -316,12 +308,9 @@ def render_frames(
 ) -> dict[str, Result]:
     """Render every frame and pass it to ``finish``; return the results by image name.
 
-    Parameters
-    ----------
-    finish : called in the process that rendered the frame, to write the files; must be picklable.
-    with_depth : names of the frames that need ``depth_m``.
-    build : returns the place with an index, the same in every process.
-    sky_seed : seed of the clouds and of the dirt on the bonnet; by default that of the world.
+    ``finish`` must be picklable and is called in the process that rendered the frame. The frames
+    named in ``with_depth`` have ``depth_m``. ``sky_seed``, by default the world's seed, determines
+    the clouds and the dirt on the bonnet.
     """
     seed = options.seed if sky_seed is None else sky_seed
     render = partial(_render, options, build, seed, frozenset(with_depth), finish)

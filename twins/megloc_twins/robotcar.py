@@ -1,8 +1,4 @@
-"""A rendered twin of RobotCar Seasons: a car with three cameras, streets in all weathers.
-
-Frames have the names of the official layout. Their poses are in the rendered world's frame and
-converted to the published one when written.
-"""
+"""A rendered twin of RobotCar Seasons: a car with three cameras, streets in all weathers."""
 
 from __future__ import annotations
 

@@ -265,8 +265,7 @@ def paint_wood(rng: Generator, height: int, width: int) -> Rgb:
 def paint_cloth(rng: Generator, height: int, width: int) -> Rgb:
     """Paint a person from one side: shoes, trousers, a printed or striped coat, a head."""
     coat, legs = random_colour(rng, 20, 230), random_colour(rng, 20, 130)
-    image = np.empty((height, width, 3), np.float32)
-    image[:] = coat
+    image = np.tile(coat, (height, width, 1))
     if rng.random() < 0.5:
         stripes = np.sin(np.arange(height) * rng.uniform(0.15, 0.5)) > 0.3
         image[stripes] = random_colour(rng, 20, 230)
@@ -327,16 +326,11 @@ PAINTERS: dict[str, Callable[..., Rgb]] = {
 
 @dataclass(frozen=True)
 class TextureRecipe:
-    """Recipe of a texture of ``width`` by ``height`` texels.
-
-    ``painter`` is a name in :data:`PAINTERS`, ``params`` are its further arguments.
-    """
-
-    painter: str
-    width: int
+    painter: str  # a name in PAINTERS
+    width: int  # texels
     height: int
     seed: int
-    params: tuple[tuple[str, str | float], ...] = ()
+    params: tuple[tuple[str, str | float], ...] = ()  # further arguments of the painter
 
     def paint(self) -> Rgb:
         rng = stream(self.seed, self.painter)

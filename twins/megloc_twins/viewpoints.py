@@ -36,19 +36,14 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, eq=False)
 class CoarseView:
-    """A view's depth at reduced resolution, and points on a sparse grid of it.
+    """A view's depth at reduced resolution, and visible points on a sparse grid of it."""
 
-    ``camera`` has that resolution; ``depth`` is float32 (h, w), metres, 0 without a surface;
-    ``points`` and ``normals``, float64 (P, 3), are visible points in the surfaces' frame,
-    ``surface`` (P,) the surfaces' indices.
-    """
-
-    camera: Camera
+    camera: Camera  # of that resolution
     cam_from_world: RigidTransform
-    depth: Float32
-    points: Float64
-    normals: Float64
-    surface: NDArray[np.int16]
+    depth: Float32  # (h, w), metres, 0 without a surface
+    points: Float64  # (P, 3), in the surfaces' frame
+    normals: Float64  # (P, 3)
+    surface: NDArray[np.int16]  # (P,), indices
 
 
 def coarse_view(
