@@ -6,7 +6,7 @@ dusk, with poses that are withheld as in a challenge. Relocalization files list 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -64,6 +64,8 @@ _EXTRA_EVERY = 8  # after every 8th keyframe, the next frame also has images
 _MARGIN_M = 0.35
 
 _SUN = {REFERENCE: (45.0, 60.0), WINTER: (20.0, 30.0), DUSK: (0.0, 5.0)}  # elevation, degrees
+# largest lateral deviation from the path, metres, and from its direction, degrees
+_DEVIATION = {REFERENCE: (0.1, 2.0), WINTER: (0.6, 8.0), DUSK: (0.9, 12.0)}
 _DUSK_SKY = (0.014, 0.03)
 _DUSK_EXPOSURE = 0.65
 
@@ -89,16 +91,6 @@ class Moment:
     frames: tuple[Frame, ...]  # of both cameras; most moments have none
 
 
-@dataclass(frozen=True)
-class Drive:
-    """A recording along the route."""
-
-    name: str  # contains the time, determines light and ground
-    keyframes_per_place: int  # at equal distances along a place's path
-    lateral_m: float  # largest lateral deviation from the path
-    turn_deg: float  # largest deviation from the path's direction
-
-
 def stereo_camera(width: int, height: int) -> Camera:
     sx, sy = width / _PUBLISHED_SIZE[0], height / _PUBLISHED_SIZE[1]
     params = (_FOCAL_PX * sx, _FOCAL_PX * sx, _CENTRE_PX[0] * sx, _CENTRE_PX[1] * sy)
@@ -115,13 +107,6 @@ class FourSeasonsTwinOptions(TwinOptions):
     width: int = Field(default=800, ge=64, description="image width in px")
     height: int = Field(default=400, ge=48, description="image height in px")
 
-    def drives(self) -> tuple[Drive, Drive, Drive]:
-        return (
-            Drive(REFERENCE, self.map_keyframes, 0.1, 2),
-            Drive(WINTER, self.winter_keyframes, 0.6, 8),
-            Drive(DUSK, self.dusk_keyframes, 0.9, 12),
-        )
-
 
 class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
     """4Seasons in its published layout, with true poses.
@@ -134,17 +119,19 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
     version = 4
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
-        options, drives = self.options, self.options.drives()
-        driven = {drive.name: list(drive_moments(options.world(), drive)) for drive in drives}
+        options, world = self.options, self.options.world()
+        driven = {
+            REFERENCE: list(drive_moments(world, REFERENCE, options.map_keyframes)),
+            WINTER: list(drive_moments(world, WINTER, options.winter_keyframes)),
+            DUSK: list(drive_moments(world, DUSK, options.dusk_keyframes)),
+        }
         keyframes = {name: [m for m in moments if m.keyframe] for name, moments in driven.items()}
         _write_calibration(root / "calibration", stereo_camera(options.width, options.height))
-        for drive in drives:
-            _write_recording(root, options, drive, driven[drive.name], work)
-            if drive.name != REFERENCE:
-                write_lines(
-                    root / f"relocalizationFile_{REFERENCE}_to_{drive.name}.txt",
-                    _relocalization_lines(keyframes[REFERENCE], keyframes[drive.name]),
-                )
+        for recording, moments in driven.items():
+            _write_recording(root / recording, world, moments, work)
+            if recording != REFERENCE:
+                path = root / f"relocalizationFile_{REFERENCE}_to_{recording}.txt"
+                _write_relocalization(path, keyframes[REFERENCE], keyframes[recording])
         truth = (
             in_frame([frame for moment in moments for frame in moment.frames], EARTH_FROM_WORLD)
             for moments in (keyframes[REFERENCE], keyframes[WINTER] + keyframes[DUSK])
@@ -152,19 +139,22 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
         return {"places": options.num_places} | write_truth(root, *truth)
 
 
-def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> Iterator[Moment]:
+def drive_moments(
+    options: SyntheticWorldOptions, recording: str, keyframes_per_place: int
+) -> Iterator[Moment]:
     """Yield the moments of a drive through all places, in order of time."""
-    rng = stream(options.seed, "drive", drive.name)
-    start = datetime.strptime(drive.name, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
+    rng = stream(options.seed, "drive", recording)
+    most_m, most_deg = _DEVIATION[recording]
+    start = datetime.strptime(recording, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
     clock = int(start.timestamp()) * 10**9
     for index in range(options.num_places):
         place = build_place(options, index)
-        sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[drive.name])))
-        phase = 0.5 if drive.name == REFERENCE else rng.uniform(0.25, 0.75)
-        for stop in range(drive.keyframes_per_place):
-            along = (stop + phase) / drive.keyframes_per_place * place.plan.path_length_m
-            lateral = _free_offset(place.plan, along, drive.lateral_m, rng)
-            turn = float(np.radians(rng.uniform(-drive.turn_deg, drive.turn_deg)))
+        sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[recording])))
+        phase = 0.5 if recording == REFERENCE else rng.uniform(0.25, 0.75)
+        for stop in range(keyframes_per_place):
+            along = (stop + phase) / keyframes_per_place * place.plan.path_length_m
+            lateral = _free_offset(place.plan, along, most_m, rng)
+            turn = float(np.radians(rng.uniform(-most_deg, most_deg)))
             pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
             for step in range(_FRAMES_PER_KEYFRAME):
                 clock += _FRAME_NS + int(rng.integers(-40_000, 40_000))
@@ -176,7 +166,7 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> Iterator[Mome
                 pose = cam_from_place @ place.place_from_world
                 frames: tuple[Frame, ...] = ()
                 if step == 0 or (step == 1 and stop % _EXTRA_EVERY == 1):
-                    images = _frames(options, drive, place, timestamp, pose, position, sun, rng)
+                    images = _frames(options, recording, place, timestamp, pose, position, sun, rng)
                     frames = tuple(images)
                 yield Moment(timestamp, pose, step == 0, frames)
         clock += 20_000_000_000  # the drive to the next place is not recorded
@@ -208,7 +198,7 @@ def _lighting(recording: str, rng: Generator, sun: tuple[float, float]) -> Light
 
 def _frames(
     options: SyntheticWorldOptions,
-    drive: Drive,
+    recording: str,
     place: Place,
     timestamp: int,
     cam0_from_world: RigidTransform,
@@ -217,13 +207,13 @@ def _frames(
     rng: Generator,
 ) -> Iterator[Frame]:
     moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
-    lighting = _lighting(drive.name, rng, sun)
+    lighting = _lighting(recording, rng, sun)
     poses = {"cam0": cam0_from_world, "cam1": CAM1_FROM_CAM0 @ cam0_from_world}
     for sensor_id, pose in poses.items():
-        name = f"{drive.name}/undistorted_images/{sensor_id}/{timestamp}.png"
+        name = f"{recording}/undistorted_images/{sensor_id}/{timestamp}.png"
         yield Frame(
             name=name,
-            condition=drive.name,
+            condition=recording,
             place=place.index,
             timestamp=timestamp,
             sensor_id=sensor_id,
@@ -255,22 +245,22 @@ def _beside(plan: FloorPlan, along: float, offset: float) -> tuple[Float64, floa
 
 
 def _write_recording(
-    root: Path, options: FourSeasonsTwinOptions, drive: Drive, moments: list[Moment], work: Work
+    folder: Path, options: SyntheticWorldOptions, moments: list[Moment], work: Work
 ) -> None:
-    folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
+    recording, exposure_ms = folder.name, _EXPOSURE_MS[folder.name]
     render_frames(
-        options.world(),
+        options,
         [frame for moment in moments for frame in moment.frames],
-        partial(_write_grey, root),
-        build=winter_place if drive.name == WINTER else build_place,
+        partial(_write_grey, folder.parent),
+        build=winter_place if recording == WINTER else build_place,
         # with the same dirt as in the map, the bonnet would yield the best matches of queries
-        sky_seed=options.seed + (list(_SUN).index(drive.name) << 32),
+        sky_seed=options.seed + (list(_SUN).index(recording) << 32),
         work=work,
     )
     times = (moment.timestamp for moment in moments)  # most have no images
     rows = [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
     write_lines(folder / "times.txt", rows)
-    if drive.name != DUSK:  # poses of test recordings are withheld
+    if recording != DUSK:  # poses of test recordings are withheld
         _write_slam_world(folder, options.seed, [m for m in moments if m.keyframe])
 
 
@@ -326,14 +316,14 @@ def _write_calibration(folder: Path, camera: Camera) -> None:
     write_lines(folder / "undistorted_calib_stereo.txt", rows)
 
 
-def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]) -> list[str]:
-    """Format the challenge's pairs: the nearest map keyframe, then the query."""
+def _write_relocalization(path: Path, reference: list[Moment], queries: list[Moment]) -> None:
+    """Write the challenge's pairs: the nearest map keyframe, then the query."""
     centers = np.array([moment.cam0_from_world.center() for moment in reference])
     lines = []
     for moment in queries:
         distances = np.linalg.norm(centers - moment.cam0_from_world.center(), axis=1)
         lines.append(f"{reference[int(distances.argmin())].timestamp} {moment.timestamp}")
-    return lines
+    write_lines(path, lines)
 
 
 def _random_transform(rng: Generator, yaw: float, tilt: float, reach_m: float) -> RigidTransform:

@@ -242,8 +242,7 @@ def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
 def build_module(recipes: Recipes, owner: str) -> Parts:
     """Build a corridor section: x from 0 to MODULE_M, y from -CORRIDOR_M / 2 to CORRIDOR_M / 2.
 
-    A rotation by 180 degrees exchanges its sides. Each side has the door of a room and a closed
-    door.
+    A rotation by 180 degrees exchanges its sides, each with the door of a room and a closed door.
     """
     half = CORRIDOR_M / 2
     parts = Parts(recipes, (0.0, -half), (MODULE_M, half))

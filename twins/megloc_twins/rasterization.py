@@ -25,14 +25,12 @@ NO_SURFACE = -1
 
 @dataclass(frozen=True, eq=False)
 class SampleGrid:
-    """The rays of a camera's samples, at the centres of ``supersampling``² cells per pixel.
-
-    ``x`` and ``y`` are normalised coordinates, float64, which broadcast to (H * supersampling,
-    W * supersampling); without distortion their shapes are (1, columns) and (rows, 1).
-    """
+    """The rays of a camera's samples, at the centres of ``supersampling``² cells per pixel."""
 
     camera: Camera
     supersampling: int
+    # normalised coordinates, broadcast to (H * supersampling, W * supersampling); without
+    # distortion their shapes are (1, columns) and (rows, 1)
     x: Float64
     y: Float64
 
@@ -47,15 +45,13 @@ class SampleGrid:
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The nearest surface along each sample's ray.
-
-    ``planes``, (N, 3, 3), are three linear forms in the ray (x_n, y_n, 1) per surface: 1/z, and the
-    two surface coordinates (0..1 inside the surface) divided by z.
-    """
+    """The nearest surface along each sample's ray."""
 
     grid: SampleGrid
     surface: NDArray[np.int16]  # (rows, columns), its index or NO_SURFACE
     inverse_depth: Float32  # (rows, columns), 1/m, 0 without a surface
+    # (N, 3, 3), linear forms in the ray (x_n, y_n, 1) per surface: 1/z, and the two surface
+    # coordinates (0..1 inside the surface) divided by z
     planes: Float64
 
 
@@ -180,10 +176,7 @@ def _bounding_boxes(corners: Float64, grid: SampleGrid) -> NDArray[np.int64]:
 
 
 def depth_map(seen: Visibility) -> Float32:
-    """Return depth along the optical axis in metres, float32 (rows, columns), 0 without a surface.
-
-    Computed in float64 from the surface's plane; exact at the samples' centres.
-    """
+    """Return depth along the optical axis, metres, float32 (rows, columns), 0 without a surface."""
     form = seen.planes[:, 0][np.maximum(seen.surface, 0)]
     inverse = form[..., 0] * seen.grid.x + form[..., 1] * seen.grid.y + form[..., 2]
     hit = seen.surface != NO_SURFACE
@@ -191,10 +184,7 @@ def depth_map(seen: Visibility) -> Float32:
 
 
 def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32:
-    """Return the colour of each sample, (rows, columns, 3), RGB 0..255; 0 without a surface.
-
-    The texture level is chosen by the area of a sample in texels; two levels are blended.
-    """
+    """Return the colour of each sample, (rows, columns, 3), RGB 0..255; 0 without a surface."""
     index = np.maximum(seen.surface, 0).astype(np.int32)
     hit = seen.surface != NO_SURFACE
     inverse = np.where(hit, seen.inverse_depth, np.float32(1.0))

@@ -116,10 +116,7 @@ def _rgb(values: Triple) -> Float32:
 
 
 def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDArray[np.uint8]:
-    """Expose an image, uint8 (H, W, 3) RGB, from the light of its samples (H * ss, W * ss, 3).
-
-    ``seed`` determines the bonnet's dirt, if the frame shows a bonnet.
-    """
+    """Expose an image, uint8 (H, W, 3) RGB, from the light of its samples (H * ss, W * ss, 3)."""
     lighting, width, height = frame.lighting, frame.camera.width, frame.camera.height
     light = averaged(light, supersampling)
     if frame.bonnet:
@@ -147,10 +144,7 @@ def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDAr
 
 @lru_cache(maxsize=4)
 def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
-    """Paint the car's bonnet, with seams, dirt and emblem; it is the same in all images of a seed.
-
-    Return its coverage (H, W), 0..1, and its linear colour (H, W, 3).
-    """
+    """Return coverage (H, W), 0..1, and linear colour (H, W, 3) of the car's bonnet in a world."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
     y = (np.arange(height, dtype=np.float32) + 0.5) / height
     edge = 0.86 + 0.11 * x**2
@@ -188,10 +182,7 @@ def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
 
 
 class PlaceRenderer:
-    """Renderer of the frames of one place; painting its textures takes about a second.
-
-    ``seed`` determines the clouds and the dirt on the bonnet.
-    """
+    """Renderer of the frames of one place; ``seed`` determines clouds and the bonnet's dirt."""
 
     def __init__(self, place: Place, *, seed: int, supersampling: int) -> None:
         self._place = place
