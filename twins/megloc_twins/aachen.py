@@ -13,10 +13,10 @@ from pydantic import Field
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
-from megloc_twins.frames import Frame, day_lighting, in_frame, looking_at, noise_seed, write_truth
+from megloc_twins.frames import Frame, day_lighting, in_frame, noise_seed, write_truth
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticDataset, TwinOptions, shuffled, stream, write_lines
-from megloc_twins.portable import Float64, settled_pose
+from megloc_twins.portable import Float64, looking_at, settled_pose
 from megloc_twins.render import render_map_and_queries
 from megloc_twins.sparse_models import Depths, as_nvm, exact_tracks, write_colmap_model, write_nvm
 from megloc_twins.squares import Place, build_place

@@ -22,11 +22,9 @@ from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.frames import (
     Frame,
-    Lighting,
     day_lighting,
+    dusk_lighting,
     in_frame,
-    looking_at,
-    night_lighting,
     noise_seed,
     write_truth,
 )
@@ -39,7 +37,7 @@ from megloc_twins.options import (
     stream,
     write_lines,
 )
-from megloc_twins.portable import Float64, settled, settled_pose
+from megloc_twins.portable import Float64, looking_at, settled, settled_pose
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
 
@@ -66,8 +64,6 @@ _MARGIN_M = 0.35
 _SUN = {REFERENCE: (45.0, 60.0), WINTER: (20.0, 30.0), DUSK: (0.0, 5.0)}  # elevation, degrees
 # largest lateral deviation from the path, metres, and from its direction, degrees
 _DEVIATION = {REFERENCE: (0.1, 2.0), WINTER: (0.6, 8.0), DUSK: (0.9, 12.0)}
-_DUSK_SKY = (0.014, 0.03)
-_DUSK_EXPOSURE = 0.65
 
 _EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
 _GREY = np.array([299, 587, 114])  # weights of R, G and B, thousandths
@@ -185,17 +181,6 @@ def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
     return replace(place, recipes=tuple(recipes))
 
 
-def _lighting(recording: str, rng: Generator, sun: tuple[float, float]) -> Lighting:
-    if recording == DUSK:
-        night = night_lighting(rng, exposure=_DUSK_EXPOSURE)
-        # the lamps are on, and the sky is still slightly bright
-        light = float(rng.uniform(*_DUSK_SKY))
-        sky = (0.85 * light, 0.95 * light, 1.25 * light)
-        return replace(night, sky=sky, sky_colour=sky)
-    overcast = 0.15 if recording == REFERENCE else float(rng.choice([0.3, 0.7, 1.0]))
-    return day_lighting(rng, sun, overcast=overcast)
-
-
 def _frames(
     options: SyntheticWorldOptions,
     recording: str,
@@ -207,7 +192,11 @@ def _frames(
     rng: Generator,
 ) -> Iterator[Frame]:
     moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
-    lighting = _lighting(recording, rng, sun)
+    if recording == DUSK:
+        lighting = dusk_lighting(rng)
+    else:
+        overcast = 0.15 if recording == REFERENCE else float(rng.choice([0.3, 0.7, 1.0]))
+        lighting = day_lighting(rng, sun, overcast=overcast)
     poses = {"cam0": cam0_from_world, "cam1": CAM1_FROM_CAM0 @ cam0_from_world}
     for sensor_id, pose in poses.items():
         name = f"{recording}/undistorted_images/{sensor_id}/{timestamp}.png"

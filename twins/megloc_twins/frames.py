@@ -14,7 +14,7 @@ from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.moving_objects import MovingObject
 from megloc_twins.options import seed_of
-from megloc_twins.portable import Float64, exp, product, settled, settled_pose
+from megloc_twins.portable import Float64, exp, settled
 
 Triple = tuple[float, float, float]
 
@@ -86,6 +86,14 @@ def night_lighting(rng: Generator, *, exposure: float = 1.0) -> Lighting:
     )
 
 
+def dusk_lighting(rng: Generator) -> Lighting:
+    """Return the light at dusk: the lamps are on, and the sky is still slightly bright."""
+    night = night_lighting(rng, exposure=0.65)
+    light = float(rng.uniform(0.014, 0.03))
+    sky = (0.85 * light, 0.95 * light, 1.25 * light)
+    return replace(night, sky=sky, sky_colour=sky)
+
+
 def lamp_lighting(rng: Generator, *, noise: float, spread: float = 0.0) -> Lighting:
     """Return the light of ceiling lamps; ``spread`` is the variation between images."""
     light = float(exp(rng.normal(0, spread)))
@@ -149,34 +157,6 @@ def road_lighting(condition: str, rng: Generator, *, azimuth: float) -> Lighting
 
 def _product(a: Triple, b: Triple) -> Triple:
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
-
-
-def looking_at(position: Float64, yaw: float, pitch: float, roll: float) -> RigidTransform:
-    """Return ``cam_from_world`` of a camera at ``position`` (3,), metres, in a frame with z up.
-
-    Its axis points along ``yaw`` (radians from +x towards +y) and ``pitch`` above the horizon;
-    ``roll`` rotates the camera about this axis (clockwise as seen by the camera).
-    """
-    forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
-    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    down = np.cross(forward, right)
-    cos, sin = np.cos(roll), np.sin(roll)
-    rotation = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
-    return settled_pose(rotation, -product(rotation, position))
-
-
-def cam_from_rig(right_deg: float, up_deg: float, position: Triple) -> RigidTransform:
-    """Return the pose of a camera on a rig with axes x right, y down and z forward, metres.
-
-    The camera points ``right_deg`` to the right and ``up_deg`` upwards, from ``position``.
-    """
-    right, up = np.radians(right_deg), np.radians(up_deg)
-    about_y = np.array(
-        [[np.cos(right), 0, -np.sin(right)], [0, 1, 0], [np.sin(right), 0, np.cos(right)]]
-    )
-    about_x = np.array([[1, 0, 0], [0, np.cos(up), np.sin(up)], [0, -np.sin(up), np.cos(up)]])
-    rotation = product(about_x, about_y)
-    return settled_pose(rotation, -product(rotation, np.array(position)))
 
 
 def reduced(camera: Camera, factor: int) -> Camera:

@@ -21,11 +21,11 @@ from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, lamp_lighting, looking_at, noise_seed, write_truth
+from megloc_twins.frames import Frame, lamp_lighting, noise_seed, write_truth
 from megloc_twins.indoor_rooms import MODULE_M, Floor, Zone, build_floor, floor_place
 from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream, write_lines
-from megloc_twins.portable import Bools, Float64, product, settled
+from megloc_twins.portable import Bools, Float64, looking_at, product, settled
 from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, visible

@@ -1,4 +1,4 @@
-"""Arithmetic with the same bits on every processor.
+"""Arithmetic and poses with the same bits on every processor.
 
 Sums, products, quotients and square roots are correctly rounded (IEEE 754), so they are equal
 everywhere. BLAS products, OpenCV filters and elementary functions depend on the processor's
@@ -55,6 +55,34 @@ def product(left: Float64, right: Float64) -> Float64:
     for term in terms:
         total = total + term
     return total[..., 0] if right.ndim == 1 else total
+
+
+def looking_at(position: Float64, yaw: float, pitch: float, roll: float) -> RigidTransform:
+    """Return ``cam_from_world`` of a camera at ``position`` (3,), metres, in a frame with z up.
+
+    Its axis points along ``yaw`` (radians from +x towards +y) and ``pitch`` above the horizon;
+    ``roll`` rotates the camera about this axis (clockwise as seen by the camera).
+    """
+    forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    down = np.cross(forward, right)
+    cos, sin = np.cos(roll), np.sin(roll)
+    rotation = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
+    return settled_pose(rotation, -product(rotation, position))
+
+
+def cam_from_rig(right_deg: float, up_deg: float, position: ArrayLike) -> RigidTransform:
+    """Return the pose of a camera on a rig with axes x right, y down and z forward, metres.
+
+    The camera points ``right_deg`` to the right and ``up_deg`` upwards, from ``position``.
+    """
+    right, up = np.radians(right_deg), np.radians(up_deg)
+    about_y = np.array(
+        [[np.cos(right), 0, -np.sin(right)], [0, 1, 0], [np.sin(right), 0, np.cos(right)]]
+    )
+    about_x = np.array([[1, 0, 0], [0, np.cos(up), np.sin(up)], [0, -np.sin(up), np.cos(up)]])
+    rotation = product(about_x, about_y)
+    return settled_pose(rotation, -product(rotation, np.array(position)))
 
 
 def resized(image: Float32, width: int, height: int, *, cubic: bool = False) -> Float32:

@@ -15,15 +15,7 @@ from megloc_kapture.datasets.robotcar.images import RIG_ID
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel, SparsePoints
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import (
-    Frame,
-    cam_from_rig,
-    in_frame,
-    looking_at,
-    noise_seed,
-    road_lighting,
-    write_truth,
-)
+from megloc_twins.frames import Frame, in_frame, noise_seed, road_lighting, write_truth
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import (
     SyntheticDataset,
@@ -33,7 +25,7 @@ from megloc_twins.options import (
     stream,
     write_lines,
 )
-from megloc_twins.portable import Float64, settled_pose
+from megloc_twins.portable import Float64, cam_from_rig, looking_at, settled_pose
 from megloc_twins.render import render_map_and_queries
 from megloc_twins.sparse_models import Depths, as_nvm, exact_tracks, write_colmap_model, write_nvm
 from megloc_twins.squares import Place, build_place

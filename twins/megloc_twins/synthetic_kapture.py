@@ -22,16 +22,10 @@ from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import (
-    Frame,
-    cam_from_rig,
-    day_lighting,
-    kapture_records,
-    looking_at,
-    noise_seed,
-)
+from megloc_twins.frames import Frame, day_lighting, kapture_records, noise_seed
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, SyntheticWorldOptions, stream
+from megloc_twins.portable import cam_from_rig, looking_at
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import query_frames

@@ -12,10 +12,10 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, day_lighting, looking_at, night_lighting, noise_seed, reduced
+from megloc_twins.frames import Frame, day_lighting, night_lighting, noise_seed, reduced
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
-from megloc_twins.portable import Bools, Float32, Float64
+from megloc_twins.portable import Bools, Float32, Float64, looking_at
 from megloc_twins.rasterization import depth_map, intrinsics, project, sample_grid, visible_surfaces
 from megloc_twins.squares import Place
 from megloc_twins.surfaces import Surfaces

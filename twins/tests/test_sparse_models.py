@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from megloc_twins.frames import Frame, day_lighting, looking_at
+from megloc_twins.frames import Frame, day_lighting
+from megloc_twins.portable import looking_at
 from megloc_twins.rasterization import depth_map, sample_grid, visible_surfaces
 from megloc_twins.sparse_models import exact_tracks
 from megloc_twins.synthetic_kapture import SyntheticWorld

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from megloc_twins.frames import looking_at
 from megloc_twins.moving_objects import (
     FloorPlan,
     MovingObject,
@@ -11,6 +10,7 @@ from megloc_twins.moving_objects import (
     moving_object_surfaces,
 )
 from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.portable import looking_at
 from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_twins.squares import Place, build_place
 
