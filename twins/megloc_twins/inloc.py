@@ -40,7 +40,6 @@ _DARK = 24.0  # mean of the channels, 0..255; darker pixels absorb the beam
 _DROPOUTS = 0.02  # share of pixels without a return, at random
 
 _FLOORS = ("DUC1", "DUC2")
-_BUILDING = "DUC"
 _FIRST_QUERY = 801  # number of the first phone image
 
 _REDUCTION = 20  # of the resolution, to test a query pose
@@ -109,7 +108,7 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
 def _transformation(floor: int, number: int) -> str:
     folder = f"database/alignments/{_FLOORS[floor]}/transformations"
-    return f"{folder}/{_BUILDING}_trans_{number:03d}.txt"
+    return f"{folder}/DUC_trans_{number:03d}.txt"
 
 
 def _cutouts(
@@ -121,7 +120,7 @@ def _cutouts(
     rng = stream(options.seed, "inloc", "light", _transformation(floor, number))
     lighting = lamp_lighting(rng, noise=1.0)
     for view, (yaw, pitch) in enumerate(itertools.product(YAWS_DEG, PITCHES_DEG)):
-        name = f"{folder}/{_BUILDING}_cutout_{number:03d}_{yaw}_{pitch}.jpg"
+        name = f"{folder}/DUC_cutout_{number:03d}_{yaw}_{pitch}.jpg"
         yield Frame(
             name=name,
             condition=_FLOORS[floor],

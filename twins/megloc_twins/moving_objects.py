@@ -122,8 +122,7 @@ def moving_object_recipes(seed: int) -> list[TextureRecipe]:
     for i in range(NUM_CARS):
         recipes.append(TextureRecipe("car", 420, 90, number + 100 + i, (("side", 1.0),)))
         recipes.append(TextureRecipe("car", 180, 90, number + 100 + i, (("side", 0.0),)))
-    recipes.append(TextureRecipe("window", 220, 60, number + 200))
-    return recipes
+    return [*recipes, TextureRecipe("window", 220, 60, number + 200)]
 
 
 def place_moving_objects(

@@ -76,11 +76,10 @@ def cam_from_rig(right_deg: float, up_deg: float, position: ArrayLike) -> RigidT
 
     The camera points ``right_deg`` to the right and ``up_deg`` upwards, from ``position``.
     """
-    right, up = np.radians(right_deg), np.radians(up_deg)
-    about_y = np.array(
-        [[np.cos(right), 0, -np.sin(right)], [0, 1, 0], [np.sin(right), 0, np.cos(right)]]
-    )
-    about_x = np.array([[1, 0, 0], [0, np.cos(up), np.sin(up)], [0, -np.sin(up), np.cos(up)]])
+    angles = np.radians(right_deg), np.radians(up_deg)
+    (cos_y, cos_x), (sin_y, sin_x) = np.cos(angles), np.sin(angles)
+    about_y = np.array([[cos_y, 0, -sin_y], [0, 1, 0], [sin_y, 0, cos_y]])
+    about_x = np.array([[1, 0, 0], [0, cos_x, sin_x], [0, -sin_x, cos_x]])
     rotation = product(about_x, about_y)
     return settled_pose(rotation, -product(rotation, np.array(position)))
 

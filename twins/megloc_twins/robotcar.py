@@ -32,7 +32,6 @@ from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, misfit, views_of
 
 REFERENCE_CONDITION = "overcast-reference"
-CAMERAS = ("left", "rear", "right")
 SCORED_CAMERA = "rear"  # also shows the car's boot
 
 # published coordinates are in metres with z up, and differ from those of the rendered world
@@ -171,13 +170,12 @@ def _moment(
     azimuth: float,
     rng: Generator,
 ) -> Iterator[Frame]:
-    """Yield the three cameras' frames at a moment of a traversal, in the order of CAMERAS."""
+    """Yield the three cameras' frames at a moment of a traversal, in the order of CAM_FROM_CAR."""
     jitter = int(rng.integers(0, 1000))
     timestamp = _STARTS_US[condition] + place.index * _PLACE_US + number * _STOP_US + jitter
     car_from_world = car_from_place @ place.place_from_world
-    moving_objects = place_moving_objects(
-        place.plan, rng, options.world().moving_objects, car_from_place.center()
-    )
+    count, position = options.world().moving_objects, car_from_place.center()
+    moving_objects = place_moving_objects(place.plan, rng, count, position)
     for camera, intrinsics in car_cameras(options.size_px).items():
         name = f"{condition}/{camera}/{timestamp}.jpg"
         lighting = road_lighting(condition, rng, azimuth=azimuth)
@@ -224,15 +222,13 @@ def _write_models(
     layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], depths_m: Depths
 ) -> None:
     """Write one model per location and a merged model, in the same coordinates."""
-    places = np.array([frame.place for frame in frames])
     parts = []
     for place in range(options.num_locations):
-        positions = np.flatnonzero(places == place).tolist()
+        positions = [index for index, frame in enumerate(frames) if frame.place == place]
         here = [frames[position] for position in positions]
-        rng = stream(options.seed, "robotcar", "points", place)
-        points = exact_tracks(here, depths_m, rng)
-        model = _colmap_model(here, points)
-        write_colmap_model(layout.individual_model(f"{place + 1:03d}"), model, text=True)
+        points = exact_tracks(here, depths_m, stream(options.seed, "robotcar", "points", place))
+        folder = layout.individual_model(f"{place + 1:03d}")
+        write_colmap_model(folder, _colmap_model(here, points), text=True)
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))
     names = [f"./{_png(frame.name)}" for frame in frames]
@@ -241,12 +237,12 @@ def _write_models(
 
 def _colmap_model(frames: Sequence[Frame], points: SparsePoints) -> ColmapModel:
     """Return a model with the published cameras: 1 left, 2 rear, 3 right, SIMPLE_RADIAL."""
-    ids = {name: number for number, name in enumerate(CAMERAS, start=1)}
+    ids = {name: number for number, name in enumerate(CAM_FROM_CAR, start=1)}
     cameras = {}
     for frame in frames:
         fx, _, cx, cy = frame.camera.params
-        size = (frame.camera.width, frame.camera.height)
-        cameras[ids[frame.sensor_id]] = Camera("SIMPLE_RADIAL", *size, (fx, cx, cy, 0.0))
+        camera = replace(frame.camera, model="SIMPLE_RADIAL", params=(fx, cx, cy, 0.0))
+        cameras[ids[frame.sensor_id]] = camera
     images = tuple(
         ColmapImage(number, _png(frame.name), ids[frame.sensor_id], frame.cam_from_world)
         for number, frame in enumerate(frames, start=1)

@@ -119,14 +119,8 @@ class SurfaceBuilder:
         count = len(self._rows)
         columns = list(zip(*self._rows, strict=True)) or [()] * 6
         origin, edge_u, edge_v = (settled(column).reshape(count, 3) for column in columns[:3])
-        return Surfaces(
-            origin,
-            edge_u,
-            edge_v,
-            np.array(columns[3], np.int32),
-            settled(columns[4]).reshape(count, 4),
-            np.array(columns[5], np.float32),
-        )
+        texture, uv = np.array(columns[3], np.int32), settled(columns[4]).reshape(count, 4)
+        return Surfaces(origin, edge_u, edge_v, texture, uv, np.array(columns[5], np.float32))
 
 
 PASSAGE = -1  # texture of an opening without window or door
