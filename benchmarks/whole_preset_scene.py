@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from megloc_twins.frames import kapture_records, noise_seed
+from megloc_twins.frames import kapture_records
 from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.render import render_frames
 from megloc_twins.synthetic_kapture import (
@@ -105,7 +105,7 @@ def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:
                     name=name,
                     timestamp=timestamp,
                     cam_from_world=SENSOR_FROM_RIG[shot.sensor_id] @ pose,
-                    noise_seed=noise_seed(world.options.seed, name),
+                    noise_seed=world.options.noise_seed(name),
                 )
             )
     return replace(world, mapping=tuple(mapping), rig_from_world=rig_from_world)

@@ -13,7 +13,7 @@ from pydantic import Field
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
-from megloc_twins.frames import Frame, day_lighting, in_frame, noise_seed, write_truth
+from megloc_twins.frames import Frame, day_lighting, in_frame, write_truth
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticDataset, TwinOptions, shuffled, stream, write_lines
 from megloc_twins.portable import Float64, looking_at, settled_pose
@@ -196,7 +196,7 @@ def _map_frame(
         camera=camera,
         cam_from_world=looking_at(at, yaw, pitch, roll) @ place.place_from_world,
         lighting=day_lighting(rng, sun, overcast=0.15),
-        noise_seed=noise_seed(options.seed, names[0]),
+        noise_seed=options.noise_seed(names[0]),
         moving_objects=place_moving_objects(place.plan, rng, options.world().moving_objects, at),
     )
 

@@ -67,9 +67,7 @@ def periodic_noise(rng: Generator, size: int, *, cell: float, octaves: int = 4) 
     return out / max(float(out.std()), 1e-6)
 
 
-def random_colour(
-    rng: Generator, low: float = 30, high: float = 225, *, chroma: float = 0.75
-) -> Colour:
+def random_colour(rng: Generator, low: float, high: float, *, chroma: float = 0.75) -> Colour:
     """Draw a random colour; ``chroma`` 0 gives grey, 1 the strongest colours of the range."""
     channels = rng.uniform(low, high, 3)
     return (channels.mean() + chroma * (channels - channels.mean())).astype(np.float32)

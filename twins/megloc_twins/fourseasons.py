@@ -20,14 +20,7 @@ from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import (
-    Frame,
-    day_lighting,
-    dusk_lighting,
-    in_frame,
-    noise_seed,
-    write_truth,
-)
+from megloc_twins.frames import Frame, day_lighting, dusk_lighting, in_frame, write_truth
 from megloc_twins.moving_objects import FloorPlan, place_moving_objects
 from megloc_twins.options import (
     SyntheticDataset,
@@ -135,9 +128,7 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
         return {"places": options.num_places} | write_truth(root, *truth)
 
 
-def drive_moments(
-    options: SyntheticWorldOptions, recording: str, keyframes_per_place: int
-) -> Iterator[Moment]:
+def drive_moments(options: SyntheticWorldOptions, recording: str, stops: int) -> Iterator[Moment]:
     """Yield the moments of a drive through all places, in order of time."""
     rng = stream(options.seed, "drive", recording)
     most_m, most_deg = _DEVIATION[recording]
@@ -147,8 +138,8 @@ def drive_moments(
         place = build_place(options, index)
         sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[recording])))
         phase = 0.5 if recording == REFERENCE else rng.uniform(0.25, 0.75)
-        for stop in range(keyframes_per_place):
-            along = (stop + phase) / keyframes_per_place * place.plan.path_length_m
+        for stop in range(stops):
+            along = (stop + phase) / stops * place.plan.path_length_m
             lateral = _free_offset(place.plan, along, most_m, rng)
             turn = float(np.radians(rng.uniform(-most_deg, most_deg)))
             pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
@@ -209,7 +200,7 @@ def _frames(
             camera=stereo_camera(options.width, options.height),
             cam_from_world=pose,
             lighting=lighting,
-            noise_seed=noise_seed(options.seed, name),
+            noise_seed=options.noise_seed(name),
             moving_objects=moving_objects,
             bonnet=True,
         )

@@ -13,7 +13,6 @@ from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.moving_objects import MovingObject
-from megloc_twins.options import seed_of
 from megloc_twins.portable import Float64, exp, settled
 
 Triple = tuple[float, float, float]
@@ -182,11 +181,6 @@ class Frame:
     noise_seed: int  # of the sensor's noise
     moving_objects: tuple[MovingObject, ...] = ()  # in the place's frame
     bonnet: bool = False  # the car's bonnet is visible
-
-
-def noise_seed(seed: int, image: str) -> int:
-    """Return the seed of an image's sensor noise in the world of ``seed``."""
-    return seed_of(seed, "noise", image.rsplit(".", 1)[0])
 
 
 def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> list[Frame]:

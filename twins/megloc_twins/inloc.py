@@ -21,7 +21,7 @@ from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, lamp_lighting, noise_seed, write_truth
+from megloc_twins.frames import Frame, lamp_lighting, write_truth
 from megloc_twins.indoor_rooms import MODULE_M, Floor, Zone, build_floor, floor_place
 from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream, write_lines
@@ -130,7 +130,7 @@ def _cutouts(
             camera=camera,
             cam_from_world=cam_from_scan(yaw, pitch) @ scan_from_floor,
             lighting=lighting,
-            noise_seed=noise_seed(options.seed, name),
+            noise_seed=options.noise_seed(name),
         )
 
 
@@ -239,8 +239,8 @@ def build_queries(options: InLocTwinOptions) -> Iterator[Frame]:
                 camera=camera,
                 cam_from_world=pose @ floor.place.place_from_world,
                 lighting=lamp_lighting(light, noise=3.0, spread=0.15),
-                noise_seed=noise_seed(options.seed, name),
-                moving_objects=_people(zone, pose, yaw, rng),
+                noise_seed=options.noise_seed(name),
+                moving_objects=tuple(_people(zone, pose, yaw, rng)),
             )
 
 
@@ -319,9 +319,7 @@ def _have_seen(scans: Sequence[ScanViews], points: Float64, position: Float64) -
     return found
 
 
-def _people(
-    zone: Zone, pose: RigidTransform, yaw: float, rng: Generator
-) -> tuple[MovingObject, ...]:
+def _people(zone: Zone, pose: RigidTransform, yaw: float, rng: Generator) -> list[MovingObject]:
     """Place up to two people in front of the phone, in half of the images."""
     people: list[MovingObject] = []
     wanted = int(rng.integers(0, 4)) - 1
@@ -334,4 +332,4 @@ def _people(
         if zone.plan.is_free(x, y, 0.3):
             turn = float(rng.uniform(-np.pi, np.pi))
             people.append(MovingObject("person", int(rng.integers(NUM_PEOPLE)), (x, y), turn))
-    return tuple(people)
+    return people

@@ -32,6 +32,10 @@ class TwinOptions(Options):
         names = SyntheticWorldOptions.model_fields.keys() & type(self).model_fields.keys()
         return SyntheticWorldOptions(**self.model_dump(include=names))
 
+    def noise_seed(self, image: str) -> int:
+        """Return the seed of an image's sensor noise."""
+        return seed_of(self.seed, "noise", image.rsplit(".", 1)[0])
+
 
 class SyntheticWorldOptions(TwinOptions):
     """Contents and images of the synthetic world.

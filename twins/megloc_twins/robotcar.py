@@ -15,7 +15,7 @@ from megloc_kapture.datasets.robotcar.images import RIG_ID
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel, SparsePoints
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, in_frame, noise_seed, road_lighting, write_truth
+from megloc_twins.frames import Frame, in_frame, road_lighting, write_truth
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import (
     SyntheticDataset,
@@ -188,7 +188,7 @@ def _moment(
             camera=intrinsics,
             cam_from_world=CAM_FROM_CAR[camera] @ car_from_world,
             lighting=lighting,
-            noise_seed=noise_seed(options.seed, name),
+            noise_seed=options.noise_seed(name),
             moving_objects=moving_objects,
             bonnet=camera == SCORED_CAMERA,
         )

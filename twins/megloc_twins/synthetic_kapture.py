@@ -22,7 +22,7 @@ from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, day_lighting, kapture_records, noise_seed
+from megloc_twins.frames import Frame, day_lighting, kapture_records
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, SyntheticWorldOptions, stream
 from megloc_twins.portable import cam_from_rig, looking_at
@@ -81,7 +81,7 @@ def _mapping_frames(
                 camera=camera,
                 cam_from_world=SENSOR_FROM_RIG[sensor_id] @ pose,
                 lighting=day_lighting(rng, sun, overcast=0.15),
-                noise_seed=noise_seed(options.seed, image),
+                noise_seed=options.noise_seed(image),
                 moving_objects=moving_objects,
                 bonnet=sensor_id == "rig_front",
             )

@@ -142,7 +142,7 @@ def paint_window(rng: Generator, height: int, width: int) -> Rgb:
     for _ in range(int(rng.integers(1, 4))):  # plants, lamps and vases on the sill
         x, w = int(rng.uniform(0.1, 0.8) * width), int(rng.uniform(0.08, 0.2) * width)
         h = int(rng.uniform(0.1, 0.35) * height)
-        colour = random_colour(rng).tolist()
+        colour = random_colour(rng, 30, 225).tolist()
         cv2.ellipse(image, (x, height - h // 2), (w, h), 0, 0, 360, colour, -1)
     bar = max(3, width // 18)
     colour = frame.tolist()

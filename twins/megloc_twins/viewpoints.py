@@ -12,7 +12,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.frames import Frame, day_lighting, night_lighting, noise_seed, reduced
+from megloc_twins.frames import Frame, day_lighting, night_lighting, reduced
 from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import SyntheticWorldOptions, stream
 from megloc_twins.portable import Bools, Float32, Float64, looking_at
@@ -148,7 +148,7 @@ def query_frames(
             camera=camera,
             cam_from_world=cam_from_place @ place.place_from_world,
             lighting=lighting,
-            noise_seed=noise_seed(options.seed, image),
+            noise_seed=options.noise_seed(image),
             moving_objects=place_moving_objects(
                 place.plan, rng, options.moving_objects, position, yaw
             ),
