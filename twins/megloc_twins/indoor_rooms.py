@@ -30,7 +30,7 @@ WALL_THICKNESS_M = 0.15
 _HEIGHT_M = 2.8
 _DOOR_M = (1.0, 2.1)  # width, height
 _DOOR_X = 0.7  # left edge of a room's door
-_POSTER_M = (0.9, 1.26)
+_FLAT_M = {"poster": (0.9, 1.26), "sign": (0.5, 0.17)}  # width, height
 _TEXELS_PER_M = 100
 _GLASS = "window"  # painter of textures that return no laser beam
 _DIRT = 0.8  # of walls, floors and ceilings; equal in rooms of a kind
@@ -111,15 +111,10 @@ class Parts:
         self.shared.add(np.array([*low, _HEIGHT_M]), along, across, ceiling, glow=_INDIRECT)
 
     def poster(
-        self,
-        on: Wall,
-        at: Point,
-        *label: str | int,
-        own: bool = True,
-        size: tuple[float, float] = _POSTER_M,
-        painter: str = "poster",
+        self, on: Wall, at: Point, *label: str | int, own: bool = True, painter: str = "poster"
     ) -> None:
         """Add a flat object to a wall; ``at`` is its lower left corner."""
+        size = _FLAT_M[painter]
         span, height = (at[0], at[0] + size[0]), (at[1], at[1] + size[1])
         texture = self.recipes.thing(painter, *label)
         on = replace(on, builder=self.own if own else self.shared)
@@ -267,8 +262,7 @@ def build_module(recipes: Recipes, owner: str) -> Parts:
         for x in (0.2, 3.2):
             parts.poster(side, (x, 0.9), owner, number, str(x))
         for x in (2.35, 5.3):
-            label = (owner, number, str(x))
-            parts.poster(side, (x, 1.6), *label, size=(0.5, 0.17), painter="sign")
+            parts.poster(side, (x, 1.6), owner, number, str(x), painter="sign")
     # a sign that hangs across the corridor, visible from its ends
     a, b = recipes.thing("sign", owner, "hanging", 0), recipes.thing("sign", owner, "hanging", 1)
     spot, size_m = (0.25 * MODULE_M, 0.0), (0.06, 0.9, 0.3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from io import BytesIO
 from pathlib import Path, PurePosixPath
@@ -53,8 +53,8 @@ _MIN_SEEN, _MIN_MARGIN = 0.6, 0.2
 _QUARTER = Camera("SIMPLE_PINHOLE", 240, 320, (120.0, 120.0, 160.0))
 _MAX_ANGLE_DEG, _MAX_DISTANCE_RATIO = 35.0, 2.0
 
-# centre of a scanner, and its views in all directions, up to the height of its cutouts
-ScanViews = tuple[Float64, list[CoarseView]]
+# centres of a floor's scanners, and their views in all directions, up to the height of the cutouts
+Scans = list[tuple[Float64, list[CoarseView]]]
 
 
 class InLocTwinOptions(TwinOptions):
@@ -245,12 +245,7 @@ def build_queries(options: InLocTwinOptions) -> Iterator[Frame]:
 
 
 def _query_poses(
-    floors: list[Floor],
-    index: int,
-    zone: Zone,
-    camera: Camera,
-    scans: Sequence[Sequence[ScanViews]],
-    rng: Generator,
+    floors: list[Floor], index: int, zone: Zone, camera: Camera, scans: list[Scans], rng: Generator
 ) -> Iterator[tuple[float, tuple[RigidTransform, float]]]:
     """Yield misfit, pose and yaw of random poses in a zone; worse ones are mostly skipped."""
     floor, plan = floors[index], zone.plan
@@ -296,13 +291,13 @@ def _copies(floors: list[Floor], index: int, zone: Zone) -> Iterator[tuple[int, 
                 yield other_index, turned
 
 
-def _scan_views(floor: Floor, zone: Zone) -> ScanViews:
+def _scan_views(floor: Floor, zone: Zone) -> tuple[Float64, list[CoarseView]]:
     poses = [cam_from_scan(yaw, 0) @ zone.scan_from_place for yaw in (0, 90, 180, 270)]
     views = [coarse_view(floor.place.surfaces, _QUARTER, pose) for pose in poses]
     return zone.scan_from_place.center(), views
 
 
-def _have_seen(scans: Sequence[ScanViews], points: Float64, position: Float64) -> Bools:
+def _have_seen(scans: Scans, points: Float64, position: Float64) -> Bools:
     """Select points (P, 3) that a scan saw from a viewpoint similar to ``position`` (3,)."""
     found = np.zeros(len(points), bool)
     here = points - position
@@ -311,9 +306,8 @@ def _have_seen(scans: Sequence[ScanViews], points: Float64, position: Float64) -
         there = points - center
         other = np.linalg.norm(there, axis=1)
         cosine = (here * there).sum(axis=1) / (distance * other)
-        alike = cosine > np.cos(np.radians(_MAX_ANGLE_DEG))
-        alike &= np.abs(np.log(distance / other)) < np.log(_MAX_DISTANCE_RATIO)
-        alike &= ~found
+        near = np.abs(np.log(distance / other)) < np.log(_MAX_DISTANCE_RATIO)
+        alike = near & (cosine > np.cos(np.radians(_MAX_ANGLE_DEG))) & ~found
         if alike.any():
             found[alike] = np.any([visible(points[alike], view) for view in views], axis=0)
     return found

@@ -199,7 +199,12 @@ def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32
     level = _level(seen, surfaces, atlas, index, inverse)
     low = np.minimum(level.astype(np.int32), NUM_LEVELS - 2)
     weight = (level - low.astype(np.float32))[..., None]
-    table = _lookup_table(surfaces, atlas)
+    # atlas pixels are x = start + u * step, y likewise; the first pixel's centre is at 0
+    corner, size = atlas.corner[surfaces.texture], atlas.size[surfaces.texture]
+    part, end = surfaces.uv[:, None, :2], surfaces.uv[:, None, 2:]
+    start, step = corner + part * size - 0.5, (end - part) * size
+    table = np.stack([start[..., 0], step[..., 0], start[..., 1], step[..., 1]], axis=-1)
+    table = np.ascontiguousarray(table.reshape(-1, 4), np.float32)
     levels = []
     for row in (index * NUM_LEVELS + low, index * NUM_LEVELS + low + 1):
         affine = np.take(table, row, axis=0)
@@ -225,15 +230,6 @@ def _level(
     constant = np.float32(0.5) * log2(np.maximum(scale, 1e-30))
     level = np.take(constant, index) - np.float32(1.5) * log2(inverse)
     return np.clip(level, 0, NUM_LEVELS - 1 - 1e-3)
-
-
-def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
-    """Return t (N * NUM_LEVELS, 4): atlas pixel x = t0 + u t1, y = t2 + v t3; first centre at 0."""
-    corner, size = atlas.corner[surfaces.texture], atlas.size[surfaces.texture]
-    start, end = surfaces.uv[:, None, :2], surfaces.uv[:, None, 2:]
-    base, step = corner + start * size - 0.5, (end - start) * size
-    table = np.stack([base[..., 0], step[..., 0], base[..., 1], step[..., 1]], axis=-1)
-    return np.ascontiguousarray(table.reshape(-1, 4), np.float32)
 
 
 @compiled_loop

@@ -199,11 +199,7 @@ class PlaceRenderer:
         cam_from_place = self._place.cam_from_place(frame)
         grid = sample_grid(frame.camera, self._supersampling)
         seen = visible_surfaces(surfaces, cam_from_place, grid)
-        shadows = None
-        if any(frame.lighting.sun):
-            shadows = cast_shadows(self._place.surfaces, frame.lighting.sun_direction)
-            shadows = add_shadows(shadows, moving_objects)
-        light = self._radiance(seen, surfaces, frame.lighting, cam_from_place, shadows)
+        light = self._radiance(seen, moving_objects, frame.lighting, cam_from_place)
         image = develop(light, frame, self._supersampling, self._seed)
         width, height = frame.camera.width, frame.camera.height
         cover = bonnet(width, height, self._seed)[0] if frame.bonnet else np.zeros((height, width))
@@ -217,14 +213,10 @@ class PlaceRenderer:
         return RenderedFrame(image, depth_m, mask)
 
     def _radiance(
-        self,
-        seen: Visibility,
-        surfaces: Surfaces,
-        lighting: Lighting,
-        cam_from_place: RigidTransform,
-        shadows: ShadowMap | None,
+        self, seen: Visibility, moving: Surfaces, lighting: Lighting, cam_from_place: RigidTransform
     ) -> Float32:
         """Return the linear light along each sample's ray, float32 (rows, columns, 3)."""
+        surfaces = self._place.surfaces.joined(moving)
         index = np.maximum(seen.surface, 0).astype(np.int32)
         # textures are painted with gamma 2
         albedo = (sample_colour(seen, surfaces, self._atlas) * np.float32(1 / 255)) ** 2
@@ -232,7 +224,9 @@ class PlaceRenderer:
         ambient = 0.62 + 0.38 * normals[:, 2]
         light = np.take(ambient.astype(np.float32), index)[..., None] * _rgb(lighting.sky)
         x, y, z = _positions(seen, cam_from_place)
-        if shadows is not None:
+        if any(lighting.sun):
+            shadows = cast_shadows(self._place.surfaces, lighting.sun_direction)
+            shadows = add_shadows(shadows, moving)
             facing = np.clip(product(normals, np.array(lighting.sun_direction)), 0, None)
             sun = np.take(facing.astype(np.float32), index) * shadows.lit(x, y, z)
             light += sun[..., None] * _rgb(lighting.sun)

@@ -231,7 +231,7 @@ def _write_models(
         write_colmap_model(folder, _colmap_model(here, points), text=True)
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))
-    names = [f"./{_png(frame.name)}" for frame in frames]
+    names = [f"./{frame.name}".replace(".jpg", ".png") for frame in frames]
     write_nvm(layout.merged_model, as_nvm(names, frames, SparsePoints.joined(parts)))
 
 
@@ -239,15 +239,15 @@ def _colmap_model(frames: Sequence[Frame], points: SparsePoints) -> ColmapModel:
     """Return a model with the published cameras: 1 left, 2 rear, 3 right, SIMPLE_RADIAL."""
     ids = {name: number for number, name in enumerate(CAM_FROM_CAR, start=1)}
     cameras = {}
+    images: list[ColmapImage] = []
     for frame in frames:
         fx, _, cx, cy = frame.camera.params
         camera = replace(frame.camera, model="SIMPLE_RADIAL", params=(fx, cx, cy, 0.0))
         cameras[ids[frame.sensor_id]] = camera
-    images = tuple(
-        ColmapImage(number, _png(frame.name), ids[frame.sensor_id], frame.cam_from_world)
-        for number, frame in enumerate(frames, start=1)
-    )
-    return ColmapModel(cameras, images, points)
+        name = frame.name.replace(".jpg", ".png")
+        image_id, camera_id = len(images) + 1, ids[frame.sensor_id]
+        images.append(ColmapImage(image_id, name, camera_id, frame.cam_from_world))
+    return ColmapModel(cameras, tuple(images), points)
 
 
 def _write_car(layout: Layout, options: RobotCarTwinOptions) -> None:
@@ -287,11 +287,7 @@ def _write_version_2(layout: Layout, options: RobotCarTwinOptions, queries: list
     rows = []
     for frame in shuffled(train, options.seed, "robotcar", "order", "train"):
         matrix = frame.cam_from_world.inverse().matrix().ravel().tolist()
-        rows.append(" ".join([_png(frame.name), *map(repr, matrix)]))
+        rows.append(" ".join([frame.name.replace(".jpg", ".png"), *map(repr, matrix)]))
     write_lines(layout.train_list, rows)
     names = [f"{frame.sensor_id}/{frame.timestamp}.png" for frame in test]
     write_lines(layout.test_list, shuffled(names, options.seed, "robotcar", "order", "test"))
-
-
-def _png(name: str) -> str:
-    return name.removesuffix(".jpg") + ".png"

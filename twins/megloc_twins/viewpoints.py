@@ -119,11 +119,7 @@ def _similar(cosine: Float64, size_ratio: Float64, slant_ratio: Float64) -> Bool
 
 
 def query_frames(
-    options: SyntheticWorldOptions,
-    place: Place,
-    mapping: Sequence[Frame],
-    condition: str,
-    total: int,
+    options: SyntheticWorldOptions, place: Place, mapping: list[Frame], condition: str, total: int
 ) -> Iterator[Frame]:
     """Yield the queries of a condition in one place, out of ``total`` in all places."""
     map_views = views_of(place, mapping)
