@@ -38,9 +38,8 @@ def exact_tracks(
     """Create sparse points seen in at least two frames, with exact observations.
 
     Pixels with depth are drawn at random in every frame, lifted to world points and projected into
-    all frames of the same place whose depth agrees. Depth, (H, W) by image name, is 0
-    without a surface. Observations are sorted by point, then image; ``feature_ids`` count from 0 in
-    each image.
+    all frames of the same place whose depth agrees. Depth, (H, W) by image name, is 0 without a
+    surface. Observations are sorted by point, then image; ``feature_ids`` count from 0 per image.
     """
     parts = [SparsePoints.none()]
     for frame in frames:
@@ -50,16 +49,11 @@ def exact_tracks(
         seen, px = _observations([frames[index] for index in here], depths_m, points)
         enough = seen.sum(1) >= 2
         of_point, of_image = np.nonzero(seen[enough])
-        parts.append(
-            SparsePoints(
-                xyz=points[enough],
-                rgb=np.full((np.count_nonzero(enough), 3), _GREY, np.uint8),
-                point_ids=of_point,
-                image_ids=np.array(here, np.int32)[of_image],
-                feature_ids=np.zeros(len(of_image), np.int32),
-                xy_px=px[enough][of_point, of_image].astype(np.float32),
-            )
-        )
+        rgb = np.full((np.count_nonzero(enough), 3), _GREY, np.uint8)
+        image_ids = np.array(here, np.int32)[of_image]
+        feature_ids = np.zeros_like(image_ids)  # numbered below
+        xy_px = px[enough][of_point, of_image].astype(np.float32)
+        parts.append(SparsePoints(points[enough], rgb, of_point, image_ids, feature_ids, xy_px))
     joined = SparsePoints.joined(parts)
     for image in np.unique(joined.image_ids):
         of_image = joined.image_ids == image
@@ -106,14 +100,10 @@ def _squared_reach(camera: Camera) -> float:
 def as_nvm(names: Sequence[str], frames: Sequence[Frame], points: SparsePoints) -> NvmModel:
     """Return the frames as images of an NVM file, under the given names."""
     lenses = np.array([intrinsics(frame.camera) for frame in frames])
-    return NvmModel(
-        names=tuple(names),
-        focal_px=lenses[:, 0],
-        quat_wxyz=np.array([frame.cam_from_world.quat_wxyz for frame in frames]),
-        centers=np.array([frame.cam_from_world.center() for frame in frames]),
-        k_colmap=lenses[:, 4],
-        points=points,
-    )
+    focal_px, k_colmap = lenses[:, 0], lenses[:, 4]
+    quat_wxyz = np.array([frame.cam_from_world.quat_wxyz for frame in frames])
+    centers = np.array([frame.cam_from_world.center() for frame in frames])
+    return NvmModel(tuple(names), focal_px, quat_wxyz, centers, k_colmap, points)
 
 
 def write_nvm(path: Path, model: NvmModel) -> None:
