@@ -228,15 +228,12 @@ def _write_recording(
     folder: Path, options: SyntheticWorldOptions, moments: list[Moment], work: Work
 ) -> None:
     recording, exposure_ms = folder.name, _EXPOSURE_MS[folder.name]
-    render_frames(
-        options,
-        [frame for moment in moments for frame in moment.frames],
-        partial(_write_grey, folder.parent),
-        build=winter_place if recording == WINTER else build_place,
-        # with the same dirt as in the map, the bonnet would yield the best matches of queries
-        sky_seed=options.seed + (list(_SUN).index(recording) << 32),
-        work=work,
-    )
+    frames = [frame for moment in moments for frame in moment.frames]
+    finish = partial(_write_grey, folder.parent)
+    build = winter_place if recording == WINTER else build_place
+    # with the same dirt as in the map, the bonnet would yield the best matches of queries
+    seed = options.seed + (list(_SUN).index(recording) << 32)
+    render_frames(options, frames, finish, build=build, sky_seed=seed, work=work)
     times = (moment.timestamp for moment in moments)  # most have no images
     rows = [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
     write_lines(folder / "times.txt", rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from megloc_twins.moving_objects import MovingObject
 from megloc_twins.portable import Float64, exp, settled
 
 Triple = tuple[float, float, float]
+Rigs = dict[str, dict[str, RigidTransform]]  # sensor_from_rig by ids of rig and sensor
 
 _DARK: Triple = (0.0, 0.0, 0.0)
 _UP: Triple = (0.0, 0.0, 1.0)
@@ -202,11 +203,7 @@ def kapture_records(frames: Iterable[Frame], *, poses: bool = True) -> KaptureDa
 
 
 def write_truth(
-    root: Path,
-    mapping: Iterable[Frame],
-    queries: Iterable[Frame],
-    *,
-    rigs: Mapping[str, dict[str, RigidTransform]] | None = None,
+    root: Path, mapping: list[Frame], queries: list[Frame], *, rigs: Rigs | None = None
 ) -> dict[str, int]:
     """Write the true poses of all images as kapture below ``root``; return the image counts."""
     counts = {}

@@ -92,14 +92,10 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
                 name = _transformation(index, number)
                 rng = stream(options.seed, "inloc", "before", name)
                 _write_transformation(root / name, scan_from_floor.inverse(), rng)
-        for frames, samples in ((mapping, 1), (queries, options.supersampling)):
-            render_frames(
-                options.world().model_copy(update={"supersampling": samples}),
-                frames,
-                partial(_write_files, root, options),
-                build=partial(floor_place, options.modules),
-                work=work,
-            )
+        finish, build = partial(_write_files, root, options), partial(floor_place, options.modules)
+        cutouts = options.world().model_copy(update={"supersampling": 1})
+        render_frames(cutouts, mapping, finish, build=build, work=work)
+        render_frames(options.world(), queries, finish, build=build, work=work)
         groups = {frame.name: ImageGroup(condition=frame.condition) for frame in queries}
         write_groups(root / GROUND_TRUTH / SIDE_TABLES, groups)
         scans = len(mapping) // (len(YAWS_DEG) * len(PITCHES_DEG))

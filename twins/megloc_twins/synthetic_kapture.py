@@ -112,13 +112,9 @@ def build_world(options: SyntheticWorldOptions) -> SyntheticWorld:
         queries += query_frames(options, place, seen, "day", options.day_queries)
         queries += query_frames(options, place, seen, "night", options.night_queries)
         mapping += seen
-    return SyntheticWorld(
-        options=options,
-        places=places,
-        rig_from_world=rig_from_world,
-        mapping=tuple(sorted(mapping, key=attrgetter("name"))),
-        queries=tuple(sorted(queries, key=attrgetter("name"))),
-    )
+    mapping.sort(key=attrgetter("name"))
+    queries.sort(key=attrgetter("name"))
+    return SyntheticWorld(options, places, rig_from_world, tuple(mapping), tuple(queries))
 
 
 class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
@@ -134,13 +130,9 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         root, world = Path(root), build_world(self.options)
-        render_frames(
-            self.options,
-            world.frames(),
-            partial(write_files, root, self.options),
-            with_depth=[frame.name for frame in world.mapping] if self.options.depth else (),
-            work=work,
-        )
+        finish = partial(write_files, root, self.options)
+        names = [frame.name for frame in world.mapping] if self.options.depth else []
+        render_frames(self.options, world.frames(), finish, with_depth=names, work=work)
         write_sensors(root / "mapping", mapping_data(world))
         write_sensors(root / "query", kapture_records(world.queries, poses=False))
         write_sensors(root / "query_gt", kapture_records(world.queries))
