@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -77,9 +77,8 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
         _write_nvm_model(models, options, database, depths_m)
         _write_colmap_model(models / "aachen_v_1_1", options, mapping, depths_m)
         for when, listed in (("day", frames.day), ("night", frames.night)):
-            cameras = {frame.name: frame.camera for frame in listed}
             path = root / f"queries/{when}_time_queries_with_intrinsics.txt"
-            _write_cameras(path, cameras, last_line_ends=False)
+            _write_cameras(path, listed, last_line_ends=False)
         queries = in_frame(frames.queries(), OFFICIAL_FROM_WORLD)
         # nothing was taken at the same time
         timed = (
@@ -242,10 +241,10 @@ def _write_nvm_model(
     points = exact_tracks(frames, depths_m, rng)
     # as if some features observed no point
     points = replace(points, feature_ids=3 * points.feature_ids + 1)
-    cameras = {frame.name: frame.camera for frame in frames}
-    write_nvm(folder / "aachen_cvpr2018_db.nvm", as_nvm(list(cameras), frames, points))
-    path = folder / "database_intrinsics.txt"
-    _write_cameras(path, dict(sorted(cameras.items())), last_line_ends=True)
+    names = [frame.name for frame in frames]
+    write_nvm(folder / "aachen_cvpr2018_db.nvm", as_nvm(names, frames, points))
+    by_name = sorted(frames, key=lambda frame: frame.name)
+    _write_cameras(folder / "database_intrinsics.txt", by_name, last_line_ends=True)
 
 
 def _write_colmap_model(
@@ -268,10 +267,12 @@ def _write_colmap_model(
     write_colmap_model(folder, model, text=False)
 
 
-def _write_cameras(path: Path, cameras: Mapping[str, Camera], *, last_line_ends: bool) -> None:
+def _write_cameras(path: Path, frames: Sequence[Frame], *, last_line_ends: bool) -> None:
     """Write a camera list; numbers have the fewest digits that preserve their value."""
     lines = []
-    for name, camera in cameras.items():
+    for frame in frames:
+        camera = frame.camera
         numbers = [str(int(v)) if v.is_integer() else repr(v) for v in camera.params]
-        lines.append(" ".join((name, camera.model, f"{camera.width} {camera.height}", *numbers)))
+        size = f"{camera.width} {camera.height}"
+        lines.append(" ".join((frame.name, camera.model, size, *numbers)))
     write_lines(path, lines, last_line_ends=last_line_ends)

@@ -103,8 +103,7 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
 
 def _transformation(floor: int, number: int) -> str:
-    folder = f"database/alignments/{_FLOORS[floor]}/transformations"
-    return f"{folder}/DUC_trans_{number:03d}.txt"
+    return f"database/alignments/{_FLOORS[floor]}/transformations/DUC_trans_{number:03d}.txt"
 
 
 def _cutouts(

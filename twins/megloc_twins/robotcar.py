@@ -229,8 +229,8 @@ def _write_models(
         points = exact_tracks(here, depths_m, stream(options.seed, "robotcar", "points", place))
         folder = layout.individual_model(f"{place + 1:03d}")
         write_colmap_model(folder, _colmap_model(here, points), text=True)
-        own = np.array(positions, np.int32)
-        parts.append(replace(points, image_ids=own[points.image_ids]))
+        image_ids = np.array(positions, np.int32)[points.image_ids]
+        parts.append(replace(points, image_ids=image_ids))
     names = [f"./{frame.name}".replace(".jpg", ".png") for frame in frames]
     write_nvm(layout.merged_model, as_nvm(names, frames, SparsePoints.joined(parts)))
 

@@ -241,13 +241,12 @@ class _TextureStore:
 
     def material(self, painter: str, kind: str, size_m: tuple[float, float], label: str) -> int:
         density = GROUND_TEXELS_PER_M
-        params: list[tuple[str, str | float]] = [("material", kind)]
-        params.append(("material_seed", seed_of(self.seed, "material")))
+        params: dict[str, str | float] = {"material": kind}
+        params["material_seed"] = seed_of(self.seed, "material")
         if painter == "wall":
-            density = _WALL_TEXELS_PER_M
-            params.append(("graffiti", float(self.rng.integers(0, 3))))
+            density, params["graffiti"] = _WALL_TEXELS_PER_M, float(self.rng.integers(0, 3))
         seed = seed_of(self.seed, self.place, label)
-        recipe = TextureRecipe(painter, *texels(size_m, density), seed, tuple(params))
+        recipe = TextureRecipe(painter, *texels(size_m, density), seed, tuple(params.items()))
         return index_of(recipe, self.recipes)
 
 

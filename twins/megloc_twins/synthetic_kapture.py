@@ -137,11 +137,8 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
         write_sensors(root / "query", kapture_records(world.queries, poses=False))
         write_sensors(root / "query_gt", kapture_records(world.queries))
         write_side_tables(root / "megloc", world)
-        return {
-            "places": len(world.places),
-            "mapping images": len(world.mapping),
-            "query images": len(world.queries),
-        }
+        mapping, queries = len(world.mapping), len(world.queries)
+        return {"places": len(world.places), "mapping images": mapping, "query images": queries}
 
 
 def mapping_data(world: SyntheticWorld) -> KaptureData:
