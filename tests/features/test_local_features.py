@@ -52,7 +52,7 @@ SMALL = {
 REFUSALS = {
     "superpoint": "23 missing keys",
     "aslfeat": "missing keys",
-    "aliked": "no ALIKED",
+    "aliked": "not an ALIKED",
     "xfeat": "does not fit XFeatModel",
     "r2d2": "does not fit R2D2Network",
 }
