@@ -20,6 +20,7 @@ from megloc_kapture.geometry.cameras import (
     focal_px,
     px_from_cam,
 )
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -179,9 +180,7 @@ class DepthVerificationOptions(Options):
 
 def compare_with_depth(
     points_in_image: Floats,
-    depth_m: NDArray[np.float32],
-    depth_camera: Camera,
-    image_from_depth: RigidTransform,
+    depth: DepthView,
     options: DepthVerificationOptions,
     sigmas: Floats | float = 0.0,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
@@ -191,12 +190,12 @@ def compare_with_depth(
     counts as 0. Returns masks (N,): points in front of the surface, behind it, and points that have
     depth to compare with.
     """
-    points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
+    points = depth.image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
     before, behind, checked = np.zeros((3, len(points)), bool)
     if options.max_sigmas is None or not len(points):
         return before, behind, checked
-    height, width = depth_m.shape
-    pixels = px_from_cam(depth_camera, points)
+    height, width = depth.depth_m.shape
+    pixels = px_from_cam(depth.camera, points)
     with np.errstate(invalid="ignore"):
         inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     rows = np.flatnonzero(inside)
@@ -204,7 +203,7 @@ def compare_with_depth(
     reach = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
     columns = np.clip(column[:, None, None] + reach[None, None, :], 0, width - 1)
     lines = np.clip(line[:, None, None] + reach[None, :, None], 0, height - 1)
-    window = depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)
+    window = depth.depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)
     known = np.isfinite(window) & (window > 0)
     # skip points next to a hole, where the sensor may have missed the surface
     whole = known.all(axis=1)
@@ -212,8 +211,8 @@ def compare_with_depth(
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)
     point_sigmas = np.nan_to_num(np.broadcast_to(sigmas, len(points))[rows])
     below, above = (
-        options.max_sigmas * np.hypot(depth_noise(depth, options.noise), point_sigmas)
-        for depth in (low, high)
+        options.max_sigmas * np.hypot(depth_noise(limit, options.noise), point_sigmas)
+        for limit in (low, high)
     )
     checked[rows] = True
     before[rows] = z < low - below

@@ -334,14 +334,8 @@ def _judge(
     through, agreeing = np.zeros((2, len(xyz)), dtype=bool)
     for image in images:
         depth, cam_from_world = _depth_and_pose(folder, image)
-        before, behind, checked = compare_with_depth(
-            cam_from_world.apply(xyz),
-            depth.depth_m,
-            depth.camera,
-            depth.image_from_depth,
-            options,
-            sigmas,
-        )
+        points = cam_from_world.apply(xyz)
+        before, behind, checked = compare_with_depth(points, depth, options, sigmas)
         through |= before
         agreeing |= checked & ~before & ~behind
     return through & ~agreeing, agreeing
@@ -356,14 +350,9 @@ def _compare(
     image, xyz, covariances = job
     depth, cam_from_world = _depth_and_pose(folder, image)
     axis = (depth.image_from_depth.inverse() @ cam_from_world).rotation_matrix()[2]
-    before, behind, checked = compare_with_depth(
-        cam_from_world.apply(xyz),
-        depth.depth_m,
-        depth.camera,
-        depth.image_from_depth,
-        options,
-        KEYPOINT_NOISE_PX * np.sqrt(_quadratic_form(covariances, axis)),
-    )
+    sigmas = KEYPOINT_NOISE_PX * np.sqrt(_quadratic_form(covariances, axis))
+    points = cam_from_world.apply(xyz)
+    before, behind, checked = compare_with_depth(points, depth, options, sigmas)
     return before | behind, int(checked.sum())
 
 

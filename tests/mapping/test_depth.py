@@ -22,6 +22,7 @@ from megloc_kapture.mapping.depth import (
     lift_keypoints,
     lift_with_covariances,
 )
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
 IMAGE = Camera("SIMPLE_RADIAL", 640, 480, (520.0, 321.0, 238.0, -0.05))
@@ -34,10 +35,15 @@ EXACT = DepthVerificationOptions(max_sigmas=3.0, noise=(0.01, 0.0, 0.0))
 
 
 def contradicted_by_depth(
-    *arguments: Any, **settings: Any
+    points: NDArray[np.float64],
+    depth_m: NDArray[np.float32],
+    camera: Camera,
+    image_from_depth: RigidTransform,
+    *settings: Any,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return masks of the points off the surface, and of those with depth."""
-    before, behind, checked = compare_with_depth(*arguments, **settings)
+    view = DepthView(camera, depth_m, image_from_depth)
+    before, behind, checked = compare_with_depth(points, view, *settings)
     return before | behind, checked
 
 
