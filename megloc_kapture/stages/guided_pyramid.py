@@ -490,7 +490,7 @@ class _AgainStage(PipelineStage):
         verification: Verification,
     ) -> dict[str, float]:
         options, out = self.options, work.out / self.writes[0]
-        second_matcher, within_one = self.second_matcher(), first.root == second.root
+        second_matcher = self.second_matcher()
         counts: dict[str, float] = {}
         for extractor in options.make_extractors():
             name = extractor.name
@@ -499,7 +499,7 @@ class _AgainStage(PipelineStage):
                 chosen = pairs_to_rematch(
                     {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
                     options.second_matching,
-                    of_both=within_one,
+                    of_both=not self.of_queries,
                 )
                 again = [ImagePair(*pair, 1.0) for pair in chosen]
                 matched = match_pairs(
@@ -513,9 +513,9 @@ class _AgainStage(PipelineStage):
                     extractor, matcher, verification, options.guided_pyramid, margin_px
                 )
                 folder = first.with_features([out, *first.features_dirs])
-                retry = partial(pyramid_queries, folder, second)
-                if within_one:
-                    retry = partial(pyramid_mapping, folder)
+                retry = partial(pyramid_mapping, folder)
+                if self.of_queries:
+                    retry = partial(pyramid_queries, folder, second)
                 num_found = {pair: row.matches for pair, row in rows.items()}
                 retried = retry(pairs, name, method, out, num_found=num_found, work=work)
                 counts |= {f"{name} {key}": count for key, count in retried.items()}
