@@ -258,6 +258,7 @@ def _missing(options: PipelineOptions) -> MissingWeightsError | None:
         (SEGMENTERS, options.preprocessing.masks.segmenter),
         *((LOCAL_FEATURES, plugin) for plugin in features),
         *((MATCHERS, plugin) for plugin in matchers),
+        (MATCHERS, options.second_matching.matcher),
         (POSE_RANKERS, options.localization.rank),
         *((POSE_REFINERS, plugin) for plugin in options.pose_refinement.by),
     ]

@@ -113,6 +113,11 @@ def test_eval_names_all_missing_weights_of_a_preset(
     assert all(line.startswith("megloc: the weights ") for line in lines[:-1])
     assert all(len(line) < 500 for line in lines)
     assert "megloc weights fetch --preset megloc" in lines[-1]
+    lightglue = ("name=lightglue", "options.weights=aliked_lightglue")
+    sets = [part for each in lightglue for part in ("--set", f"second_matching.matcher.{each}")]
+    done = megloc("eval", "kapture", "--root", scene, *sets, "--dry-run")
+    assert done.status == 2 and done.out == ""
+    assert done.err.startswith("megloc: the weights aliked_lightglue are missing: ")
 
 
 def test_a_restricted_licence_needs_consent_before_any_download(megloc: Any, folder: Path) -> None:
