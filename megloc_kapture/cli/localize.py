@@ -55,8 +55,8 @@ class Localize(Reading, Deciding, Common):
     """Kapture folder with the queries, and with their features if no extractor for the map's type
     of features is installed."""
     images: tuple[Path, ...] = ()
-    """Instead of --query: photographs, videos, or folders of them. Focal lengths come from EXIF or
-    a guess and are estimated with the poses."""
+    """Instead of --query: photographs, videos, or folders of them. Focal lengths start from
+    EXIF or a guess and are refined with the poses."""
     camera: str | None = None
     """Camera of all --images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS as
     in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
@@ -98,8 +98,8 @@ class Localize(Reading, Deciding, Common):
             names, images = set(queries.names), set(kapture_map.images)
             require(
                 any(name in names and not images.isdisjoint(c) for name, c in given.items()),
-                "no row has a query and an image of the map, with their names in the kapture "
-                f"folders, as in: {min(names)}, {min(images)}, 1.0",
+                "no row names both a query and a map image; a valid row would be: "
+                f"{min(names)}, {min(images)}, 1.0",
                 path=self.pairs,
             )
         inputs = (path, self.query)
@@ -132,7 +132,7 @@ class Localize(Reading, Deciding, Common):
 
     def _check_queries(self) -> None:
         if (self.query is None) == (not self.images):
-            raise OptionError("give the queries: either --query, a kapture folder, or --images")
+            raise OptionError("give the queries: --query (a kapture folder) or --images")
         check_option(
             self.query is None or not self.query.is_file(),
             f"--query {self.query}: not a kapture folder; a list of cameras goes to "
@@ -210,7 +210,7 @@ def _read_token(path: Path) -> str:
     token = read_text(path).strip()
     require(
         len(token) >= _MIN_TOKEN_LENGTH and token.isascii() and token.isprintable(),
-        f"a token is one line of {_MIN_TOKEN_LENGTH} or more printable characters",
+        f"a token is one line of {_MIN_TOKEN_LENGTH} or more printable ASCII characters",
         path=path,
     )
     return token

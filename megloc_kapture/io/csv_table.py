@@ -42,7 +42,7 @@ def read_csv_table(
             set(columns).difference(optional) <= set(header) <= set(columns)
         ):
             expected, actual = ",".join(columns), " ".join(",".join(header).split())
-            message = f"the header must name the columns {expected}; it reads {actual!r}"
+            message = f"the columns should be {expected}; the header reads {actual!r}"
             raise DataError(message, path=path, line=1)
         for fields in filter(None, reader):
             if len(fields) != len(header):
@@ -56,7 +56,7 @@ def read_csv_table(
 def write_csv_table(
     path: Path | str, columns: Sequence[str], rows: Iterable[Iterable[object]]
 ) -> None:
-    """Write rows of text, numbers, tuples of text and poses; None and NaN give empty cells."""
+    """Write rows of text, numbers, poses and tuples of text; None and NaN give empty cells."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)

@@ -67,13 +67,13 @@ def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
 
 
 def _text_of(error: Exception, path: Path | str | None) -> str:
-    """Describe an incomplete download, or return an error's first sentence without addresses."""
+    """Describe a failed download, or return an error's first sentence without object reprs."""
     with contextlib.suppress(OSError), open(path or "", "rb") as file:
         start = file.read(100).lstrip()
         if not start:
             return "the file is empty"
         if start.startswith(b"version https://git-lfs"):
-            return "a pointer of Git LFS; fetch the file with `git lfs pull`"
+            return "a Git LFS pointer; fetch the file with `git lfs pull`"
         if start[:9].lower() in (b"<!doctype", b"<html>", b"<html lan"):
             return "a web page; download the file itself"
     text = getattr(error, "strerror", None) or str(error)
@@ -144,7 +144,7 @@ def temporary_name() -> str:
 
 
 def clear_temporary(folder: Path, *, nested: bool = True) -> None:
-    """Remove unfinished files from a folder without other writers and, if ``nested``, below it."""
+    """Remove unfinished files in (if ``nested``, also below) a folder with no other writer."""
     find = folder.rglob if nested else folder.glob
     for path in list(find(f"{TEMPORARY}*")):
         remove(path)
@@ -238,7 +238,7 @@ def similar_name(path: Path) -> str:
     with contextlib.suppress(OSError):
         for name in os.listdir(path.parent):
             if plain(name) == plain(path.name):
-                return f"; {name!r} differs in capitals, or in how accents are encoded (macOS)"
+                return f"; {name!r} differs in case, or in how accents are encoded (macOS)"
     return ""
 
 
@@ -264,7 +264,7 @@ def link_images(
 
 
 def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
-    """Link folders or images below ``sensors/records_data``, or all of it (``""``), to datasets."""
+    """Link names below ``sensors/records_data`` (``""``: the folder itself) to their targets."""
     records = Path(output_root) / "sensors" / "records_data"
     for name, target in links.items():
         link = records / name if name else records

@@ -82,9 +82,9 @@ def staged_output(
 ) -> Iterator[Path]:
     """Yield a staging folder whose content moves to ``folder`` when the block succeeds.
 
-    Files that the last command of this kind wrote are removed, unless ``adds`` is set. All other
-    files in ``folder`` are kept. Raise OutputError if ``folder`` is or contains one of the
-    ``inputs``.
+    Files that the last command of this kind wrote are removed, unless ``adds`` is set. Other files
+    in ``folder`` are kept unless overwritten. Raise OutputError if ``folder`` is or contains one of
+    the ``inputs``.
     """
     folder = Path(folder)
     if any(Path(path).resolve().is_relative_to(folder.resolve()) for path in inputs if path):

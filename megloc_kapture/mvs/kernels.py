@@ -85,9 +85,9 @@ def correlate(reference, warped, radius, costs):
 def add_path(cost, grey, p1, p2, edge, dy, dx, total):
     """Add the costs of the best paths along one direction to ``total``.
 
-    Equation 13 of Hirschmueller, PAMI 2008, is
+    Equation 13 of Hirschmueller, PAMI 2008:
     ``L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + p1, min_k L(q, k) + p2') - min_k L(q, k)``
-    with q = p - (dy, dx), and ``p2' = max(p1, floor(p2 edge / (edge + |I(p) - I(q)|)))``.
+    with q = p - (dy, dx); here ``p2' = max(p1, floor(p2 edge / (edge + |I(p) - I(q)|)))``.
     """
     height, width, depth = cost.shape
     before = np.full((width, depth + 2), _FAR, np.float32)
@@ -152,9 +152,9 @@ def count_agreeing(
 ):
     """Increment ``counts`` (H, W) where ``inverse`` agrees with another view after a round trip.
 
-    ``infinity`` and ``baseline`` project into the other view, ``back_infinity`` and
-    ``back_baseline`` back into this view. ``max_px`` limits the round-trip error, ``max_share`` the
-    relative depth difference.
+    The homography ``infinity`` (of points at infinity) and ``baseline`` project into the other
+    view, ``back_infinity`` and ``back_baseline`` back into this one. ``max_px`` limits the
+    round-trip error, ``max_share`` the relative depth difference.
     """
     height, width = inverse.shape
     rows, columns = other.shape

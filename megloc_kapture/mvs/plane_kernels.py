@@ -236,9 +236,9 @@ def plane_deviations(
     """Write the standard deviation of each pixel's inverse depth to ``out`` (H, W), 0 if unknown.
 
     A window of N pixels has brightness variance V, gradient g and correlation rho with a source; m
-    is its motion along the epipolar line per unit of inverse depth. The least-squares bound of the
-    variance is ``(1 - rho^2) V / (N mean((g m)^2))``, of which the harmonic mean is taken over the
-    sources with rho of at least 0.3. The square root of that mean is multiplied by
+    is its motion along the epipolar line per unit of inverse depth. The least-squares bound on
+    the inverse depth's variance is ``(1 - rho^2) V / (N mean((g m)^2))``, averaged harmonically
+    over the sources with rho of at least 0.3. The square root of that mean is multiplied by
     ``calibration[1]``, and a matching error of ``calibration[0]`` pixels is added in quadrature.
     """
     height, width = reference.shape

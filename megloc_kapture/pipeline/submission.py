@@ -65,8 +65,8 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
     wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
     if tables is None and wanted not in plain:
         raise OptionError(
-            f"the rules of {dataset} are in the megloc/ folder of the imported dataset, which is "
-            "missing; give it with --side-tables (submit) or --data (check)"
+            f"the rules of {dataset} are missing; give the imported dataset with --data (check), "
+            "or its megloc/ folder with --side-tables (submit)"
         )
     official = {name for name in dataset_names() if name not in plain}
     check_option(
@@ -92,7 +92,7 @@ def write_submission(
     Parameters
     ----------
     place : the file; for MLAD a folder with one file per relocalization file.
-    tables : the workspace's ``megloc/`` folder; without it, all queries count, in the map frame.
+    tables : the workspace's ``megloc/`` folder; without it, all queries are used, in the map frame.
     provenance : entries for the provenance (dataset, preset, options).
     from_rig : derive missing and fallback poses from other cameras of the rig.
 
@@ -165,7 +165,7 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
     if from_rig:
         require(
             data.rigs,
-            "poses cannot be derived from the rig: neither queries nor result has a rigs.txt",
+            "poses cannot be derived from the rig: the queries have no rigs.txt",
             path=localized,
         )
         # from the camera with the most inliers; fallback poses are replaced, never propagated
@@ -244,7 +244,7 @@ def _mlad(results: _Results, tables: Path) -> _Content:
 
 
 def workspace_provenance(localized: Path) -> dict[str, Any]:
-    """Return fingerprint, preset and options of a result, as far as manifests are up to date."""
+    """Return a result's fingerprint, preset and options, if its manifests are up to date."""
     made, manifests = _made_by(localized)
     if made is None:
         return {}

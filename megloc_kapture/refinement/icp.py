@@ -68,7 +68,7 @@ class IcpOptions(Options):
         default=(0.3, 0.15, 0.075),
         min_length=1,
         description="largest distance between corresponding points, metres, one per voxel size; "
-        "the overlap is the share of the query's points within the last",
+        "the last defines the overlap: the share of the query's points that close to the map",
     )
     depth: DepthCloudOptions = Field(
         default_factory=DepthCloudOptions, description="limits of trusted depths"
@@ -98,8 +98,8 @@ class IcpOptions(Options):
         default=0.5,
         ge=0,
         le=1,
-        description="smallest share of the query's points within the first of max_distances_m of "
-        "the map before refinement, and within the last after it",
+        description="smallest share of the query's points close to the map: within the first of "
+        "max_distances_m before refinement, within the last after it",
     )
     max_moved_m: float = Field(
         default=0.3, gt=0, description="largest accepted movement of the centre, metres"
@@ -147,8 +147,8 @@ def refine_by_icp(
 ) -> PoseRefinement:
     """Fit a query's points (N, 3), in the camera frame, to the map's (M, 3), float64 in metres.
 
-    ``measures`` of the result: residuals are median distances from the map's planes within the
-    coarsest distance; overlaps are the shares of points within the finest distance.
+    ``measures`` of the result: residuals are median distances from the map's planes within
+    ``max_distances_m[0]``, overlaps the shares of points within ``max_distances_m[-1]``.
     """
     options = options or IcpOptions()
     # move the origin to the camera, so that coordinates are small

@@ -227,7 +227,7 @@ def test_kapture_data_of_others_is_not_replaced_even_if_forced(tmp_path: Path) -
         (b"", "the file is empty"),
         (
             b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
-            "a pointer of Git LFS; .*`git lfs pull`",
+            "a Git LFS pointer; .*`git lfs pull`",
         ),
         (b"\n<!DOCTYPE html><html>", "a web page; download the file itself"),
         (b"P6 1", "no header"),

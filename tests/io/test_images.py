@@ -205,5 +205,5 @@ def test_a_name_in_other_capitals_or_accents_is_named(
     tmp_path: Path, stored: str, asked: str
 ) -> None:
     (tmp_path / stored).touch()
-    with pytest.raises(DataError, match=f"no such image; '{stored}' differs in capitals"):
+    with pytest.raises(DataError, match=f"no such image; '{stored}' differs in case"):
         read_image_rgb(tmp_path / asked)

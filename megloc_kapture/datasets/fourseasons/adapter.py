@@ -5,7 +5,7 @@ A challenge's relocalization files lie in the root, in one of its folders, or in
 nearby keyframe to each query. Poses are in the reference recording's scene (east-north-up), with an
 origin near its keyframes.
 ``ECEF_from_cam = e_from_gpsw * inv(w_from_gpsw) * s_from_as * scale * slam_from_cam``, with the
-scale of the pose's row or, if the row lacks it, of Transformations.txt.
+names of Transformations.txt (s = w) and the scale of the pose's row or, failing that, that file.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class FourSeasonsOptions(Options):
     )
     frames: Literal["keyframes", "all"] = Field(
         default="keyframes",
-        description="images to import: keyframes with a pose (of a query recording, those in the "
+        description="images to import: keyframes with a pose (for queries: those in the "
         "relocalization files, if any), or all images on disk",
     )
     stereo: bool = Field(default=True, description="also import the right camera")
@@ -81,7 +81,7 @@ class FourSeasonsOptions(Options):
         default=1,
         ge=0,
         le=2,
-        description="lowest quality of keyframes to use: 2 fused with GNSS, 1 interpolated, 0 none",
+        description="lowest fusion quality to use: 2 fused with GNSS, 1 interpolated, 0 neither",
     )
 
 
@@ -151,7 +151,7 @@ class FourSeasons:
         rules: dict[str, Any] = {
             "conditions": tuple(recording.name for recording in chosen.queries)
         }
-        if not chosen.files:  # no challenge: write absolute poses in ECEF
+        if not chosen.files:  # no challenge: write absolute poses
             rules |= {"thresholds": _GENERAL_THRESHOLDS, "pose_file": "ltvl"}
         return OfficialDataset(
             mapping=mapping,
