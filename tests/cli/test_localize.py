@@ -100,7 +100,7 @@ def test_given_pairs_replace_retrieval(megloc: Any, foreign: Path) -> None:
     for first, second in (("q/1.jpg", "0003.jpg"), (names[1], "x.jpg")):
         write_pairs(foreign / "pairs.txt", [ImagePair(first, second, 1.0)])
         done = megloc(*localize(foreign, foreign / "none"), "--pairs", foreign / "pairs.txt")
-        assert done.status == 2 and "pairs.txt: no row names both a query and a map image" in done.err
+        assert done.status == 2 and "pairs.txt: no row names both a query and" in done.err
 
 
 def test_without_shared_global_features_candidates_come_from_vlad(
