@@ -18,14 +18,21 @@ from scipy.spatial.transform import Rotation
 import megloc_kapture as megloc
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
-from megloc_kapture.io.dataset_tables import read_unreadable
+from megloc_kapture.io.dataset_tables import (
+    World,
+    read_unreadable,
+    write_unreadable,
+    write_world,
+)
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.map_making import (
     colmap_maps_folder,
+    describe_map,
     kapture_of,
     options_of_photographs,
 )
+from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.values import Camera, RigidTransform
 from tests.rendering import corner
 
@@ -241,6 +248,19 @@ def test_photographs_without_a_common_scene_are_refused(room: Path, tmp_path: Pa
         DataError, match=r"0 photo.* \(2 more .* 0000.jpg: .*its camera says 100x512"
     ):
         megloc.map_photographs(tmp_path / "few", workspace=tmp_path / "wrong", camera=wrong)
+
+
+def test_a_map_is_described_with_the_photographs_it_lacks(room: Path, tmp_path: Path) -> None:
+    put(tmp_path / "photos", images_of(room)[:4])
+    (tmp_path / "photos" / "torn.jpg").write_bytes(b"torn")
+    photographs = Photographs([tmp_path / "photos"])
+    assert (len(photographs.names), len(photographs.unreadable)) == (4, 1)
+    missing = {"torn.jpg": "unreadable", photographs.names[0]: "too few matches"}
+    write_unreadable(tmp_path / "megloc", missing, UNREGISTERED)
+    write_world(tmp_path / "megloc", World())
+    lines = describe_map(tmp_path, photographs)
+    assert lines[0].startswith("map of 3 of 5 photographs: ")
+    assert "not in the map: torn.jpg: unreadable" in lines
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,8 @@ def test_first_and_last_stage(plan: Plan) -> None:
     assert [r.why for r in plan.run()] == ["", "", "not done yet"]
     with pytest.raises(OptionError, match="--until a comes before --from c"):
         plan.run(first="c", last="a")
+    with pytest.raises(OptionError, match="--until b comes before --from c"):
+        plan.run(first="c", last="b")
 
 
 def test_a_dry_run_runs_nothing(plan: Plan) -> None:

@@ -235,6 +235,23 @@ def test_the_focal_length_of_an_uncalibrated_camera_is_estimated(
     np.testing.assert_allclose(saved.camera_of(first).params, found.camera.params)
 
 
+def test_a_guessed_camera_fits_the_size_of_the_keypoints(
+    queries: tuple[KaptureMap, KaptureFolder], workspace: Path
+) -> None:
+    opened, folder = queries
+    data = folder.read()
+    name = data.image_names()[0]
+    (_, sensor), known = data.record_of(name), data.camera_of(name)
+    half = ("UNKNOWN_CAMERA", str(known.width // 2), str(known.height // 2))
+    write_sensors(
+        folder.root, replace(data, sensors={**data.sensors, sensor: Sensor("", "camera", half)})
+    )
+    for features, part in (([workspace], 2), ([], 1)):  # without keypoints, the image's size
+        found = KaptureQueries(KaptureFolder(folder.root, features_dirs=features), opened)
+        camera = found.query(name).camera
+        assert (camera.width, camera.height) == (known.width // part, known.height // part)
+
+
 def test_cameras_are_scaled_to_smaller_images(
     queries: tuple[KaptureMap, KaptureFolder], caplog: pytest.LogCaptureFixture
 ) -> None:
