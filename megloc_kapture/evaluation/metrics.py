@@ -97,8 +97,8 @@ def pose_errors(
     position_m, angle_deg = np.full((2, len(listed)), np.inf)
     posed = [i for i, name in enumerate(listed) if name in estimated]
     if posed:
-        # compare world_from_cam with kapture's sequence of operations: errors then equal kapture's
-        # to the last bit, and a query exactly on a threshold counts alike
+        # compare world_from_cam by kapture's sequence of operations: errors then equal kapture's to
+        # the last bit, and a query exactly on a threshold counts alike
         quats, centers = invert(*stack_poses(estimated[listed[i]] for i in posed))
         true_quats, true_centers = invert(*stack_poses(truth[listed[i]] for i in posed))
         position_m[posed] = np.linalg.norm(centers - true_centers, axis=1)
@@ -330,7 +330,7 @@ def confidence_of(
 
 
 def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[Bin, ...]:
-    """Sort poses by confidence (N,) into ten bins of equal width; ``right`` (N,) are correct."""
+    """Sort poses by confidence (N,) into ten equal-width bins; ``right`` marks correct ones."""
     number = np.clip(np.ceil(confidences * NUM_BINS).astype(int) - 1, 0, NUM_BINS - 1)
     bins = []
     for index in range(NUM_BINS):

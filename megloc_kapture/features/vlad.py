@@ -301,7 +301,7 @@ def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDA
 def soft_assignment(
     descriptors: NDArray[np.floating[Any]], centres: NDArray[np.floating[Any]], alpha: float
 ) -> NDArray[np.float64]:
-    """Return ``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
+    """Return ``a_k(x_i)`` of NetVLAD's equation 2: (N, K) float64, rows sum to one."""
     from scipy.special import softmax
 
     data = np.asarray(descriptors, dtype=np.float64)

@@ -11,7 +11,7 @@ depth.csv            stereo depth of the map's images
 match_counts.csv     numbers of raw and verified matches of each pair, per feature type
 ==================== =============================================================================
 
-The functions below take the path of the file and keep the order of the rows, unless noted.
+Most functions below take the file's path; all keep the order of the rows unless noted.
 """
 
 from __future__ import annotations

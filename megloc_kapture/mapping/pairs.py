@@ -45,7 +45,7 @@ def each_once(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class PairsByPosesOptions(Options):
-    """Options of pairs by poses, which need no metric scale since neighbours are counted."""
+    """Options of pairs by poses; they count neighbours, so the scale need not be metric."""
 
     num_neighbours: int = Field(
         default=20, gt=0, description="number of nearest camera centres per image"
@@ -102,7 +102,7 @@ _MIN_SHARED_POINTS = 15
 
 
 class PairsByCovisibilityOptions(Options):
-    top_k: int = Field(default=20, gt=0, description="number of images that share the most points")
+    top_k: int = Field(default=20, gt=0, description="number of most co-visible images per image")
 
 
 def pairs_by_covisibility(

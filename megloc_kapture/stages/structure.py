@@ -170,7 +170,7 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
     for (timestamp, device), name in data.records_camera.items():
         if name in model.poses:
             sensor = model.sensors[name]
-            # an image with a different camera gets its own sensor
+            # images with a different camera share a new sensor
             own_sensor = (
                 sensor if sensor in data.sensors else f"{device}_{data.record_of(sensor)[0]}"
             )

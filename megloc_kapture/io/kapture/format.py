@@ -65,7 +65,7 @@ class Sensor:
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
 
-    The dicts may be changed, except the members of existing rigs once poses have been requested.
+    The dicts may be changed, but once poses have been requested, ``rigs`` may only be added to.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ def check_field(name: str) -> str:
     """Return an image name if it is a plain path and a valid CSV field; raise DataError if not."""
     check_relative(name)
     if "," in name or name != name.strip():
-        raise DataError(f"image name {name!r} has a comma, or a space at an end")
+        raise DataError(f"image name {name!r} has a comma or an outer space")
     return name
 
 

@@ -52,7 +52,7 @@ UNVERIFIED = "unverified"  # subfolder of user files, used if the published file
 _REGISTRY = Path(__file__).with_name("registry.toml")
 # keys under which training scripts keep the state dict
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "net", "extractor")
-# prefixes from torch's parallel, lightning's and compiled modules
+# prefixes from DataParallel, Lightning and torch.compile
 _PREFIXES = re.compile(r"^(module\.|model\.|_orig_mod\.)+")
 _Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
 _Text = Annotated[str, StringConstraints(min_length=1)]
@@ -291,7 +291,7 @@ def _load_torch(path: Path, mapped: bool) -> Any:
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     of_scores: list[Any] = [np.dtype, type(np.dtype("f4")), type(np.dtype("f8"))]
     of_scores += [(scalar, name) for name in names]
-    what = "weights of torch or safetensors that hold no code (docs/weights.md converts others)"
+    what = "weights of torch or safetensors that hold no code (for others see docs/weights.md)"
     with reading(path, what), torch.serialization.safe_globals(of_scores):
         return torch.load(path, weights_only=True, map_location="cpu", mmap=mapped)
 
@@ -308,7 +308,7 @@ def _state_dict(content: Any, path: Path) -> dict[str, torch.Tensor]:
         for key, value in items
         if isinstance(value, torch.Tensor)
     }
-    require(tensors, "holds no tensors by name", path=path)
+    require(tensors, "holds no named tensors", path=path)
     return tensors
 
 
@@ -359,7 +359,7 @@ def add_weights(
 ) -> WeightsFile:
     """Copy a file into the folder of weights under its registered name.
 
-    An ``unverified`` file may differ from the published file and is used while that is missing.
+    An ``unverified`` file may differ from the published one and is used only if that is absent.
     """
     require(source.is_file(), "no such file", path=source)
     described = describe(source.name, source)
@@ -368,7 +368,7 @@ def add_weights(
     expected = next((f for f in weights.files if f.name == target), None)
     if expected is not None and expected.convert:
         command = how_to_convert(weights, source)
-        raise DataError(f"is not read as it is; convert it once: {command}", path=source)
+        raise DataError(f"cannot be read as is; convert it once: {command}", path=source)
     check_sha256(describe(weights.name, source), None if unverified else expected)
     read_weights(described)
     path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
@@ -426,4 +426,4 @@ def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, s
             "--name (megloc weights list)"
         )
     kept_as = ", ".join(file.name for _, file in files)
-    raise OptionError(f"{source}: {name} is kept as {kept_as} or {among[0].converted}")
+    raise OptionError(f"{source}: its suffix is not that of {kept_as} or {among[0].converted}")
