@@ -172,7 +172,7 @@ def test_unknown_files_are_added_under_a_given_name(folder: Path, tmp_path: Path
     with pytest.raises(OptionError, match="no weights 'openibble' in the registry"):
         add_weights(source, name="openibble")
     other = source.rename(source.with_suffix(".bin"))
-    with pytest.raises(OptionError, match=r"kept as vgg16_netvlad\.pth or openibl\.safetensors"):
+    with pytest.raises(OptionError, match=r"that of vgg16_netvlad\.pth or openibl\.safetensors"):
         add_weights(other, name="openibl")
     converted = tmp_path / "x.safetensors"
     save_file({"a": torch.ones(1)}, converted)
