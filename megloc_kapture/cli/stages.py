@@ -293,12 +293,12 @@ class PairsQuery(Reading, Choosing, Working):
     """Rerank the candidates by local matches and keep this many."""
     rerank_by: Literal["coverage", "verified", "matches"] = "coverage"
     """Score of a candidate. matches: number of matches; verified: number of matches that a two-view
-    geometry verifies; coverage: number of verified matches at query keypoints that no better
-    candidate matches."""
+    geometry verifies; coverage: number of verified query keypoints not yet covered by better
+    candidates."""
     local_features: tuple[str, ...] = ()
-    """Types of local features to rerank by; if omitted, all types of map and queries."""
+    """Types of local features to rerank by; if omitted, all that both folders have."""
     matches_dir: Path | None = None
-    """Folder for the matches computed for reranking; later steps use them."""
+    """Folder for the matches computed for reranking."""
     force: Overwrite = False
     """Overwrite the pairs file, and write into a non-empty folder of matches."""
 
@@ -409,7 +409,7 @@ class Preprocess(Computing, Working):
     output: Output
     """Kapture folder of the new images."""
     resize: int | None = None
-    """Reduce images to a larger side of so many px, then crop both sides to multiples of 8."""
+    """Reduce the larger side to this many px, then crop both sides to multiples of 8."""
     undistort: bool = False
     """Remove lens distortion."""
     segmenter: str | None = None
@@ -429,7 +429,7 @@ class Preprocess(Computing, Working):
     user_masks: Path | None = None
     """Folder of masks IMAGE.png; pixels of value 0 are masked."""
     set: Texts = ()
-    """Change another option: key=value (upscale); may be repeated."""
+    """Another option, such as upscale=true; may be repeated."""
     force: Force = False
 
     def run(self) -> None:

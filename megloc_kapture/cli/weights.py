@@ -52,8 +52,8 @@ class List(Common):
 
         print(as_text(pd.DataFrame([_row(weights) for weights in registry().values()])))
         print(f"\nfolder of weights: {weights_folder()}")
-        print("(!) megloc weights fetch asks for consent: --accept-licence")
-        print("* facts that are not confirmed on the original file:")
+        print("(!) megloc weights fetch needs --accept-licence")
+        print("* not checked against the original file:")
         for weights in registry().values():
             if weights.unverified:
                 print(f"  {weights.name}: {weights.unverified}")
@@ -204,10 +204,7 @@ def _say_to_convert(weights: Weights, file: PublishedFile, place: Path) -> None:
 def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile, str]:
     file = weights.to_fetch
     if file is None or file.url is None:
-        raise MissingWeightsError(
-            f"{weights.name} cannot be downloaded automatically: download it from {weights.page} "
-            "and run: megloc weights add FILE"
-        )
+        raise MissingWeightsError(f"no automatic download: {how_to_get(weights)}")
     check_option(
         weights.commercial or accepted,
         f"{weights.name} needs your consent to its licence: {weights.licence}: {weights.terms} "
@@ -295,8 +292,8 @@ def find_problems() -> list[str]:
     torch, vision = installed_version("torch"), installed_version("torchvision")
     if vision and torch and "+cpu" in torch:
         problems.append(
-            f"torchvision {vision} with torch {torch}: its CPU builds fail to import and break "
-            "transformers too; pip uninstall torchvision"
+            f"torchvision {vision} may fail to import with torch {torch}, and then breaks "
+            "transformers; pip uninstall torchvision"
         )
     if installed_version("opencv-python") and installed_version("opencv-python-headless"):
         problems.append(

@@ -104,15 +104,18 @@ def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") 
     truth = 0
     if is_kapture(root / QUERY_GT):
         truth_data = KaptureFolder(root / QUERY_GT).read()
-        strange = sorted(truth_data.poses().keys() - set(query_data.image_names()))
+        queries = set(query_data.image_names())
+        strange = sorted(truth_data.poses().keys() - queries)
         truth = len(truth_data.poses()) - len(strange)
         if strange:
             tell_of_truth_without_query(root / QUERY_GT, strange)
-        write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
+        records = {key: name for key, name in truth_data.records_camera.items() if name in queries}
+        of_queries = replace(truth_data, records_camera=records)
+        write_sensors(output / QUERY_GT, _renamed(of_queries, rename, is_truth=True))
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)
     elif query_data.trajectories:
-        _log.warning("%s: has poses; only those in query_gt/ are taken for true poses", query.root)
+        _log.warning("%s: has poses; only those in query_gt/ count as true poses", query.root)
     tables = _renamed_tables(read_side_tables(root / SIDE_TABLES), rename, map_data, query_data)
     write_side_tables(output / SIDE_TABLES, tables)
     return {

@@ -165,7 +165,7 @@ def view_data(
     # cameras and points separately, so that a thousand points do not outweigh ten cameras
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
-    # rounded, so that the JSON has the exact origin
+    # rounded, to keep the JSON short
     origin = np.round((low + high) / 2, 3)
     rays = _rays(context.queries, [query.image for query in queries], context.cameras)
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
@@ -271,7 +271,7 @@ def _frusta(
     for frustum, pose, of_camera in zip(frusta, poses, rays, strict=True):
         if pose is not None:
             frustum[0] = pose.center() - origin
-            frustum[1:] = of_camera @ pose.rotation_matrix()  # R^T x of rows
+            frustum[1:] = of_camera @ pose.rotation_matrix()  # R^T x per row
     return frusta
 
 

@@ -229,8 +229,8 @@ def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> tor
     """Return the peakiness scores (H, W) of features (C, H, W) (equations 6 to 8 of ASLFeat).
 
     With y = features / scale, the score is the maximum over the channels of
-    softplus(y - local mean) * softplus(y - channel mean). The local mean is over a dilated 3x3
-    neighbourhood, with reflection padding.
+    softplus(y - local mean) * softplus(y - mean over channels). The local mean is over a dilated
+    3x3 neighbourhood, with reflection padding.
     """
     channels, height, width = features.shape
     pixels = features.permute(1, 2, 0)

@@ -5,9 +5,8 @@ meet in front of both cameras. Without (query pairs): LO-RANSAC of the relative 
 progressive sampling (Chum and Matas, CVPR 2005).
 
 With rays r = (x, y, 1) the epipolar constraint is C = r_b . E r_a = 0. The Sampson distance is |C|
-divided by the norm of the derivatives of C with respect to the four pixel coordinates, which
-include the derivative of the camera's projection (Hartley and Zisserman, Multiple View Geometry,
-eq. 4.13).
+divided by the norm of the derivatives of C with respect to the four pixel coordinates, by the chain
+rule through the camera's unprojection (Hartley and Zisserman, Multiple View Geometry, eq. 4.13).
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _SAMPLE = 5  # matches that determine a relative pose
 _THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best result counts
 # largest expected number of false alarms; strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
-# how often a wrong match agrees is measured on about this many mismatched pairs at most
+# at most about this many mismatched pairs measure how often a wrong match agrees
 _MAX_WRONG_PAIRS = 20_000
 # a pair with fewer verified matches counts as not overlapping
 MIN_MATCHES = 15
@@ -47,7 +46,7 @@ class KnownPoseOptions(Options):
     """Options of verification with known poses."""
 
     max_error_px: float = Field(
-        default=4.0, gt=0, description="largest Sampson distance in the images"
+        default=4.0, gt=0, description="largest Sampson distance of a match"
     )
 
 
@@ -55,7 +54,7 @@ class TwoViewOptions(Options):
     """Options of two-view verification; cameras are calibrated, so planes are not degenerate."""
 
     max_error_px: float = Field(
-        default=4.0, gt=0, description="largest distance of an inlier from its epipolar line"
+        default=4.0, gt=0, description="largest Sampson distance of an inlier"
     )
     max_iterations: int = Field(
         default=50,
@@ -191,7 +190,7 @@ def two_view_of_variants(
     base_matches: NDArray[np.int64],
     options: TwoViewOptions,
 ) -> PairVerifier:
-    """Return a two-view verifier; variants must agree with the model of the most matches.
+    """Return a two-view verifier; variants must fit the pose of the largest match set.
 
     Keypoints are (N, 2 or more) and (M, 2 or more); ``base_matches`` int64 (K, 2) are the verified
     matches of the images themselves.
@@ -200,8 +199,8 @@ def two_view_of_variants(
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
 
     def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        # errors are measured at the mean focal length of the originals; a reduced variant lowers
-        # the mean, which makes a pixel larger by this factor
+        # errors are in pixels at the originals' mean focal length; at the smaller mean with the
+        # variant's, a pixel is larger by this factor
         coarser = (focal + other_focal) / (_precision(features.variant) * focal + other_focal)
         return verify_two_view(
             features.keypoints_px[matches[:, 0], :2],

@@ -240,5 +240,5 @@ def load_state(
         return {**content, "step": int(content["step"])}
     except Exception as error:  # torch raises many kinds of errors on damaged files
         raise DataError(
-            "is damaged, or the state of another training; -f starts over", path=path
+            "is damaged or from another training run; -f starts over", path=path
         ) from error

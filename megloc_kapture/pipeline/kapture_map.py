@@ -212,11 +212,11 @@ class KaptureMap:
         """Return the reason if the map contradicts itself in a sample of its images, or None."""
         for name, keypoints in self.keypoints.items():
             images = [image for image in self.images if image in keypoints]
-            # consecutive images, as poses may be shifted by one image
+            # runs of consecutive images, spread over the map
             run, number = 10, _SAMPLED_IMAGES // 10
             starts = np.linspace(0, max(len(images) - run, 0), number).astype(int).tolist()
             taken = sorted({at for start in starts for at in range(start, start + run)})
-            # keep stored coordinates: half a pixel of another origin is far below the tolerance
+            # keep stored coordinates: an origin off by half a pixel is far below the tolerance
             sample = observed_keypoints(
                 self.folder, keypoints.index, (images[at] for at in taken if at < len(images))
             )
@@ -297,7 +297,7 @@ def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dic
     origins = {}
     for name, origin in origin_of.items():
         if origin.intrinsics != intrinsics:
-            # the estimate is of the difference only, so equal origins stay equal
+            # only the difference is estimated, so equal origins stay equal
             agree = origin.keypoints == origin.intrinsics
             keypoints = intrinsics if agree else origin.keypoints
             reason = f"{origin.reason}; intrinsics from {most}: {intrinsics}"

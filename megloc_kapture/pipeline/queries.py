@@ -25,12 +25,12 @@ from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform, c
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """One image to localize; camera, keypoints and pose are in COLMAP's convention.
+    """One image to localize; camera and keypoints are in COLMAP's convention.
 
     Parameters
     ----------
     image : uint8 (H, W, 3) RGB or the path of an image file; optional if features are given.
-    features, global_features : given features by type of the map; missing local features are
+    features, global_features : given features, by the map's types; missing local ones are
         extracted.
     prior : map images that may be matched; None means all.
     candidates : map images to match, best first, instead of retrieval.
@@ -93,14 +93,14 @@ class Query:
         shape = (self.camera.height, self.camera.width, 3)
         require(
             image.dtype == np.uint8 and image.shape == shape,
-            f"query {self.name}: an image of its camera is uint8 {shape}, got {image.dtype} "
+            f"query {self.name}: its camera needs an image uint8 {shape}, got {image.dtype} "
             f"{image.shape}",
         )
         return image
 
 
 class QueryImage(ProcessedFrame):
-    """Preprocessed pixels, mask and depth of a query, computed lazily, with the matching camera.
+    """Preprocessed pixels and mask of a query (lazy), their camera, and the unchanged depth.
 
     A query with given local features is neither resized nor undistorted.
     """

@@ -230,12 +230,14 @@ def pair_map_images(
 ) -> list[ImagePair]:
     """Pair the posed map images of each coordinate frame; return sorted pairs of sorted names.
 
-    If no image has a pose, all images are paired, by methods other than ``poses``. The score of a
+    If no image has a pose, all images are paired; ``poses`` then raises DataError. The score of a
     pair is its (fused) similarity if retrieval chose it, else 1. ``covisible`` is a map of the same
     images whose points are used for co-visibility, by default ``mapping``.
     """
     data = mapping.read()
     poses = data.poses()
+    if not poses and "poses" in options.by:
+        raise DataError("pairs by poses: no image has a pose", path=mapping.root)
     images = sorted(poses) or data.image_names()
     point_ids, image_ids = np.zeros(0, np.int64), np.zeros(0, np.int64)
     if options.needs_points():

@@ -202,7 +202,7 @@ def _checked(
     xy, (height, width) = features.keypoints_px[:, :2], frame[0].shape[:2]
     # detectors may refine a keypoint slightly beyond the border
     if xy.shape[1] != 2 or (xy < -1).any() or (xy > (width + 1, height + 1)).any():
-        raise PluginError(f"{who}: keypoints outside of {width}x{height} pixels; give x, y")
+        raise PluginError(f"{who}: keypoints are not x, y within {width}x{height} pixels")
     return features
 
 

@@ -28,7 +28,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 from megloc_kapture.io.kapture.folder import ARRAY_KINDS
 
-# detector implementations differ by some tenths of a pixel
+# detector implementations differ by tenths of a pixel
 _MAX_SHIFT_PX = 1.0
 # smallest proportion of observations with an extracted keypoint at their position
 _MIN_FOUND_AGAIN = 0.5

@@ -140,6 +140,13 @@ def test_pairs_without_their_inputs_are_refused(
     megloc(*command, *given).refused(message)
 
 
+def test_images_without_poses_cannot_be_paired_by_poses(
+    megloc: Any, scene: Path, tmp_path: Path
+) -> None:
+    command = ("pairs-mapping", "-i", scene / "query", "-o", tmp_path / "pairs.txt")
+    megloc(*command, "--by", "poses").refused("query: pairs by poses: no image has a pose")
+
+
 def test_pairs_of_unknown_images_are_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0000.jpg, 0002.jpg, 1.0\n0000.jpg, 0001.jpg, 1.0\n")

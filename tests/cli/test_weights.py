@@ -136,7 +136,7 @@ def test_a_restricted_licence_needs_consent_before_any_download(megloc: Any, fol
     [
         ((), "choose weights to fetch: free, bound"),
         (("fre",), "no weights 'fre' in the registry; did you mean 'free'\\? there are"),
-        (("by-hand",), "by-hand cannot be downloaded automatically: .*megloc weights add FILE"),
+        (("by-hand",), "no automatic download: .*by-hand .*megloc weights add FILE"),
     ],
 )
 def test_weights_that_cannot_be_fetched_are_refused(

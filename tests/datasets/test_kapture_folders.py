@@ -68,10 +68,11 @@ def test_truth_is_optional_and_may_have_other_images(
     write_part(root, "query_gt", ["b/q.png", "s.png"], poses=True, images=False)
     assert import_kapture_folders(root, tmp_path / "a")["queries_with_truth"] == 1
     assert "query_gt: true poses of 1 images that are not queries" in caplog.text
+    assert KaptureFolder(tmp_path / "a" / "query_gt").read().poses().keys() == {"b/q.png"}
     (root / "query_gt/sensors/sensors.txt").unlink()
     assert import_kapture_folders(root, tmp_path / "b")["queries_with_truth"] == 0
     assert not (tmp_path / "b" / "query_gt").exists()
-    assert "query: has poses; only those in query_gt/ are taken for true poses" in caplog.text
+    assert "query: has poses; only those in query_gt/ count as true poses" in caplog.text
 
 
 @pytest.mark.parametrize("prefix", ["", "q"])

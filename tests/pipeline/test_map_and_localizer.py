@@ -130,7 +130,7 @@ def test_unusable_maps_are_refused(workspace: Path, map_copy: Path, tmp_path: Pa
         KaptureMap.open(map_copy, pixel_origin="middle")  # type: ignore[arg-type]
     with pytest.raises(DataError, match="no such kapture folder"):
         KaptureMap.open(tmp_path / "nowhere")
-    with pytest.raises(DataError, match="no kapture folder, but .*mapping.*: give one of them"):
+    with pytest.raises(DataError, match="not a kapture folder; it has .*mapping.*: give"):
         KaptureMap.open(workspace)
     with pytest.raises(DataError, match="points3d.txt: a file; give a kapture folder"):
         KaptureMap.open(map_copy / "reconstruction" / "points3d.txt")

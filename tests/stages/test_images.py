@@ -370,7 +370,7 @@ def test_keypoints_outside_of_the_image_are_refused(
             return LocalFeatures(np.array([keypoint], np.float32), one, one[:, None])
 
     folder = small_kapture({"a.png": noise()})
-    with pytest.raises(PluginError, match="keypoints outside of 160x120 pixels; give x, y"):
+    with pytest.raises(PluginError, match="keypoints are not x, y within 160x120 pixels"):
         extract_local_features([folder], Mistaken(), tmp_path / "features")
 
 

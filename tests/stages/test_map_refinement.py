@@ -196,7 +196,7 @@ def test_unsuitable_folders_are_refused(
         densify_map(world.mapping(), tmp_path / "a", OPTIONS)
     with pytest.raises(DataError, match="records_data/mvs"):
         densify_map(densified, tmp_path / "b", OPTIONS)
-    with pytest.raises(DataError, match="no kapture folder.*`megloc import colmap` makes a map"):
+    with pytest.raises(DataError, match="not a kapture folder.*`megloc import colmap` makes a map"):
         densify_map(KaptureFolder(tmp_path), tmp_path / "b", OPTIONS)
     write_sensors(tmp_path / "blind", world.map().read())
     shutil.copytree(world.map().root / "reconstruction", tmp_path / "blind" / "reconstruction")

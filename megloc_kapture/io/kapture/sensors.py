@@ -53,10 +53,10 @@ def read_kapture_data(root: Path) -> KaptureData:
     if not folder.is_dir():
         inner = ", ".join(sorted(p.parents[1].name for p in root.glob("*/sensors/sensors.txt")))
         if inner:
-            raise DataError(f"no kapture folder, but {inner} in it: give one of them", path=root)
+            raise DataError(f"not a kapture folder; it has {inner}: give one of them", path=root)
         raise DataError(
-            "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
-            "--images` localizes them, `megloc map` makes a map of them. A COLMAP model? `megloc "
+            "not a kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
+            "--images` localizes them, `megloc map` maps them. A COLMAP model? `megloc "
             "import colmap` makes a map of it. Poses? `megloc evaluate` takes a model, or "
             "a file with rows name qw qx qy qz tx ty tz of cam_from_world",
             path=root,
@@ -175,7 +175,7 @@ def _record_key(
     require(re.fullmatch("[+-]?[0-9]+", fields[0]), f"timestamp {fields[0]!r} is not an integer")
     key = (int(fields[0]), fields[1])
     if key[1] not in devices:
-        raise DataError(f"unknown sensor or rig {key[1]!r}: list it, or delete its rows")
+        raise DataError(f"unknown sensor or rig {key[1]!r}: define it, or delete its rows")
     if key in known:
         raise DataError(f"timestamp {key[0]} of {key[1]!r} is listed twice")
     return key
