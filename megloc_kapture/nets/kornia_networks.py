@@ -32,7 +32,7 @@ _building = Lock()
 
 def require_kornia(what: str) -> None:
     if importlib.util.find_spec("kornia") is None:
-        raise OptionError(f"{what} needs kornia: pip install 'megloc-kapture[kornia]'")
+        raise OptionError(f"{what} needs kornia: pip install 'megloc-kapture[torch]'")
 
 
 def load_xfeat(tensors: Tensors, where: str) -> nn.Module:
