@@ -7,7 +7,6 @@ et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -16,21 +15,11 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
-from torch import nn
-from torch.nn import functional
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import Images
 from megloc_kapture.geometry.cameras import reduced_size
-from megloc_kapture.nets.delg import delg_from, describe
-from megloc_kapture.nets.global_descriptors import (
-    STRIDE_PX,
-    VggNetVlad,
-    apgem_from,
-    netvlad,
-    openibl,
-    whitening_from,
-)
+from megloc_kapture.nets.delg import delg_from
+from megloc_kapture.nets.global_descriptors import STRIDE_PX, apgem_from, netvlad, openibl
 from megloc_kapture.nets.megaloc import PATCH_PX, megaloc_from, squared
 from megloc_kapture.nets.runtime import (
     Checkpointed,
@@ -39,8 +28,6 @@ from megloc_kapture.nets.runtime import (
     inference,
     sized_tensor,
 )
-
-Tensors = Mapping[str, torch.Tensor]
 
 _OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX = 640, 480
 _MEGALOC_SIZE_PX = 322  # side of the input image in section 4 of the paper
@@ -69,16 +56,13 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
     def describe_many(self, images: Images) -> NDArray[np.float32]:
         network, device = self.network(self._load, *self._load_with)
         batch = torch.cat([self._seen(image, device) for image in images])
-        return self._vectors(network, batch).cpu().numpy()
+        with inference(device, self.options.half_precision):
+            vectors: torch.Tensor = network(batch)
+            return vectors.cpu().numpy()
 
     def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
         options: Any = self.options
         return sized_tensor(image, options.max_size_px, device)
-
-    def _vectors(self, network: Any, batch: torch.Tensor) -> torch.Tensor:
-        with inference(batch.device, self.options.half_precision):
-            vectors: torch.Tensor = network(batch)
-            return vectors
 
 
 class NetVladOptions(NetworkOptions):
@@ -92,26 +76,7 @@ class NetVladOptions(NetworkOptions):
     )
 
 
-class _VggNetVladNetwork(GlobalNetwork[GlobalOptions]):
-    def _vectors(self, network: VggNetVlad, batch: torch.Tensor) -> torch.Tensor:
-        height, width = batch.shape[-2:]
-        if min(height, width) < STRIDE_PX:
-            raise DataError(
-                f"the network's input has {width}x{height} pixels, but needs at least "
-                f"{STRIDE_PX} on each side"
-            )
-        half_precision = self.options.half_precision
-        with inference(batch.device, half_precision):
-            features = network.features(batch).float()
-            # colours of 0 to 255 may overflow float16 in this trunk
-            overflow = half_precision and not bool(features.isfinite().all())
-        with inference(batch.device):
-            if overflow:
-                features = network.features(batch)
-            return network.vectors(features)
-
-
-class NetVlad(_VggNetVladNetwork[NetVladOptions]):
+class NetVlad(GlobalNetwork[NetVladOptions]):
     """NetVLAD on VGG-16 with whitening: unit-norm float32 (4096,)."""
 
     name = method = "netvlad"
@@ -129,7 +94,7 @@ class OpenIblOptions(NetworkOptions):
     )
 
 
-class OpenIbl(_VggNetVladNetwork[OpenIblOptions]):
+class OpenIbl(GlobalNetwork[OpenIblOptions]):
     """OpenIBL's VGG-16 with NetVLAD and PCA: unit-norm float32 (4096,)."""
 
     name = method = "openibl"
@@ -176,36 +141,18 @@ class ApGemOptions(NetworkOptions):
     )
 
 
-def _apgem_with_whitening(
-    tensors: Tensors, where: str, whitening: str, power: float
-) -> nn.ModuleList:
-    modules: list[nn.Module] = [apgem_from(tensors, where)]
-    if whitening:
-        modules.append(whitening_from(tensors, whitening, where, power=power))
-    return nn.ModuleList(modules)
-
-
 class ApGem(GlobalNetwork[ApGemOptions]):
     """AP-GeM: unit-norm float32 (2048,); checkpoint, whitening and power are in the type name."""
 
     name = method = "apgem"
     Options = ApGemOptions
-    _load = staticmethod(_apgem_with_whitening)
+    _load = staticmethod(apgem_from)
 
     def __init__(self, options: ApGemOptions | None = None) -> None:
         super().__init__(options)
         self._load_with = self.options.whitening, self.options.whitening_power
         if self.options.whitening:
             self.name += f"-{self.options.whitening}-{self.options.whitening_power:g}"
-
-    def _vectors(self, network: Any, batch: torch.Tensor) -> torch.Tensor:
-        net, *whitening = network
-        with inference(batch.device, self.options.half_precision):
-            vectors: torch.Tensor = net.describe(batch)
-        with inference(batch.device):
-            for whiten in whitening:
-                vectors = functional.normalize(whiten(vectors))
-        return vectors
 
 
 class DelgOptions(NetworkOptions):
@@ -230,15 +177,15 @@ class Delg(GlobalNetwork[DelgOptions]):
     Options = DelgOptions
     _load = staticmethod(delg_from)
 
+    def __init__(self, options: DelgOptions | None = None) -> None:
+        super().__init__(options)
+        self._load_with = (self.options.scales,)
+
     def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
         height, width = image.shape[:2]
         size = reduced_size(width, height, self.options.max_size_px)
         sized = np.array(image if size == (width, height) else _bilinear(image, size))
         return torch.from_numpy(sized).to(device)[None].permute(0, 3, 1, 2).float()
-
-    def _vectors(self, network: Any, batch: torch.Tensor) -> torch.Tensor:
-        with inference(batch.device, self.options.half_precision):
-            return describe(network, batch, self.options.scales)
 
 
 class MegaLocOptions(NetworkOptions):

@@ -44,9 +44,9 @@ _LEAST_PX = 5  # smaller sides vanish in the unpadded pooling
 
 
 class DelgNet(nn.Module):
-    def __init__(self, depth: Depth, form: Form) -> None:
+    def __init__(self, depth: Depth, form: Form, scales: Sequence[float] = (1.0,)) -> None:
         super().__init__()
-        self.form = form
+        self.form, self.scales = form, scales
         keras, epsilon = form == "keras", _EPSILONS[form]
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, bias=keras)
         self.bn1 = nn.BatchNorm2d(64, eps=epsilon)
@@ -63,6 +63,28 @@ class DelgNet(nn.Module):
         self.embedding = nn.Linear(channels, DESCRIPTOR_SIZE)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Sum the unit-norm vectors of all scales and normalise (section 4.1): float32 (B, 2048).
+
+        ``image`` is RGB (B, 3, H, W) in [0, 255], resized bilinearly without antialiasing; sides
+        are rounded half to even.
+        """
+        normalised = (image - 128.0) / 128.0
+        total = image.new_zeros(len(image), DESCRIPTOR_SIZE)
+        for scale in self.scales:
+            # compute in float32 as TensorFlow does: the precision can decide the rounding of a half
+            sides = [round(float(np.float32(n) * np.float32(scale))) for n in image.shape[-2:]]
+            if min(sides) < _LEAST_PX:
+                raise DataError(
+                    f"an image of {image.shape[-1]} x {image.shape[-2]} pixels is too small for "
+                    f"DELG: at scale {scale:g} its sides must be at least {_LEAST_PX}"
+                )
+            resized = functional.interpolate(
+                normalised, sides, mode="bilinear", align_corners=False, antialias=False
+            )
+            total += functional.normalize(self.at_one_scale(resized))
+        return functional.normalize(total)
+
+    def at_one_scale(self, image: torch.Tensor) -> torch.Tensor:
         """Compute unnormalised vectors (B, 2048) of RGB images (B, 3, H, W) in [-1, 1]."""
         for number in range(1, 5):
             layer = self.get_submodule(f"layer{number}")
@@ -84,30 +106,9 @@ class DelgNet(nn.Module):
         return functional.max_pool2d(x, 3, stride=2)
 
 
-def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torch.Tensor:
-    """Sum the unit-norm vectors of several scales and normalise (section 4.1): float32 (B, 2048).
-
-    ``image`` is RGB (B, 3, H, W) in [0, 255], resized bilinearly without antialiasing; sides are
-    rounded half to even.
-    """
-    normalised = (image - 128.0) / 128.0
-    total = image.new_zeros(len(image), DESCRIPTOR_SIZE)
-    for scale in scales:
-        # compute in float32 as TensorFlow does: the precision can decide the rounding of a half
-        sides = [round(float(np.float32(n) * np.float32(scale))) for n in image.shape[-2:]]
-        if min(sides) < _LEAST_PX:
-            raise DataError(
-                f"an image of {image.shape[-1]} x {image.shape[-2]} pixels is too small for DELG: "
-                f"at scale {scale:g} its sides must be at least {_LEAST_PX}"
-            )
-        resized = functional.interpolate(
-            normalised, sides, mode="bilinear", align_corners=False, antialias=False
-        )
-        total += functional.normalize(net(resized))
-    return functional.normalize(total)
-
-
-def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
+def delg_from(
+    tensors: Mapping[str, torch.Tensor], where: str, scales: Sequence[float] = (1.0,)
+) -> DelgNet:
     blocks = {key.split(".")[1] for key in tensors if key.startswith("layer3.")}
     if len(blocks) not in RESNET_DEPTHS:
         raise DataError(
@@ -115,5 +116,6 @@ def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
             f"(ResNet-101); found: {first_few(sorted(tensors), 8)}",
             path=where,
         )
-    net = DelgNet(RESNET_DEPTHS[len(blocks)], "keras" if "conv1.bias" in tensors else "slim")
+    form: Form = "keras" if "conv1.bias" in tensors else "slim"
+    net = DelgNet(RESNET_DEPTHS[len(blocks)], form, scales)
     return load_strictly(net, tensors, where, may_lack=batch_counters(net)).eval()

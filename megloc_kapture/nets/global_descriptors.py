@@ -93,7 +93,18 @@ class VggNetVlad(nn.Module):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Return unit-norm vectors (B, output size) of RGB images (B, 3, H, W) in [0, 1]."""
-        return self.vectors(self.features(image))
+        height, width = image.shape[-2:]
+        if min(height, width) < STRIDE_PX:
+            raise DataError(
+                f"the network's input has {width}x{height} pixels, but needs at least "
+                f"{STRIDE_PX} on each side"
+            )
+        features = self.features(image).float()
+        with torch.autocast(image.device.type, enabled=False):
+            # in half precision, colours of 0 to 255 may overflow in this trunk
+            if not bool(features.isfinite().all()):
+                features = self.features(image)
+            return self.vectors(features)
 
     def features(self, image: torch.Tensor) -> torch.Tensor:
         """Return features (B, 512, H // 16, W // 16) of RGB images (B, 3, H, W) in [0, 1]."""
@@ -156,7 +167,8 @@ class ApGemNet(ResNet):
     """AP-GeM's network from image to unit-norm vector.
 
     ``mean`` and ``deviation`` are those of the training images, RGB in [0, 1].
-    ``normalised_features`` normalises pooled features before the last layer.
+    ``normalised_features`` normalises pooled features before the last layer. ``whitening`` is set
+    by :func:`apgem_from`.
     """
 
     mean: torch.Tensor
@@ -174,23 +186,32 @@ class ApGemNet(ResNet):
         self.adpool = nn.ParameterDict({"p": torch.full((1,), 3.0)})
         self.fc = nn.Linear(DESCRIPTOR_SIZE, DESCRIPTOR_SIZE)
         self.normalised_features = normalised_features
+        self.whitening: nn.Linear | None = None
         for name, values in (("mean", mean), ("deviation", deviation)):
             self.register_buffer(
                 name, torch.as_tensor(values).float().view(3, 1, 1), persistent=False
             )
 
-    def describe(self, image: torch.Tensor) -> torch.Tensor:
+    def forward(self, image: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
         """Return unit-norm vectors float32 (B, 2048) of RGB images (B, 3, H, W) in [0, 1]."""
-        features = self((image - self.mean) / self.deviation)[-1]
+        features = super().forward((image - self.mean) / self.deviation)[-1]
         with torch.autocast(image.device.type, enabled=False):
             pooled = generalized_mean(features, self.adpool["p"])
             if self.normalised_features:
                 pooled = functional.normalize(pooled)
-            return functional.normalize(self.fc(pooled))
+            vectors = functional.normalize(self.fc(pooled))
+            if self.whitening is None:
+                return vectors
+            return functional.normalize(self.whitening(vectors))
 
 
-def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
-    """Build the network from the tensors of ``scripts/convert_weights.py``, for inference."""
+def apgem_from(
+    tensors: Mapping[str, torch.Tensor], where: str, whitening: str = "", power: float = 0.25
+) -> ApGemNet:
+    """Build the network from the tensors of ``scripts/convert_weights.py``, for inference.
+
+    ``whitening`` and ``power`` are those of :func:`whitening_from`; an empty name means none.
+    """
     beside = ("preprocess.", "model_options.", "pca.")
     state = {key: value for key, value in tensors.items() if not key.startswith(beside)}
     blocks = {key.split(".")[1] for key in state if key.startswith("layer3.")}
@@ -205,7 +226,10 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
         deviation=tensors.get("preprocess.std", IMAGENET_DEVIATION),
         normalised_features=bool(tensors.get("model_options.norm_features", False)),
     )
-    return load_strictly(net, state, where, may_lack=batch_counters(net)).eval()
+    load_strictly(net, state, where, may_lack=batch_counters(net))
+    if whitening:
+        net.whitening = whitening_from(tensors, whitening, where, power=power)
+    return net.eval()
 
 
 def whitening_from(

@@ -28,7 +28,6 @@ from megloc_kapture.features.global_networks import (
     official_size,
 )
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.nets import delg as nets_delg
 from megloc_kapture.nets import megaloc as nets_megaloc
 from megloc_kapture.nets.global_descriptors import ApGemNet, VggNetVlad, whitening_from
 from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet
@@ -142,12 +141,8 @@ def test_vectors_equal_the_network(name: str, make: Make) -> None:
     assert many.shape == (2, size) and many.dtype == np.float32
     assert np.abs(many[0] - many[1]).max() > apart
     net, _ = plugin.network(plugin._load, *plugin._load_with)
-    describe = {
-        "apgem": lambda batch: net[0].describe(batch),
-        "delg": lambda batch: nets_delg.describe(net, batch, (1.0,)),
-    }.get(name, net)
     with torch.inference_mode():
-        np.testing.assert_allclose(many, describe(seen(plugin, *images)).numpy(), atol=1e-5)
+        np.testing.assert_allclose(many, net(seen(plugin, *images)).numpy(), atol=1e-5)
 
 
 def test_missing_weights_and_weights_of_another_network_are_refused(

@@ -11,7 +11,7 @@ from convert_weights import delg_state
 from published import delg_shapes, delg_variables
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.delg import DelgNet, Form, delg_from, describe
+from megloc_kapture.nets.delg import DelgNet, Form, delg_from
 
 # written by TensorFlow, see data/README.md
 REFERENCE = Path(__file__).parent / "data" / "delg" / "reference.npz"
@@ -26,7 +26,7 @@ def form(request: pytest.FixtureRequest) -> Form:
 
 @pytest.fixture(scope="module")
 def net(form: Form) -> DelgNet:
-    return delg_from(delg_state(delg_variables(form)), "x.safetensors")
+    return delg_from(delg_state(delg_variables(form)), "x.safetensors", SCALES)
 
 
 def empty(kind: str) -> dict[str, np.ndarray]:
@@ -40,8 +40,9 @@ def test_vectors_equal_tensorflow(net: DelgNet, form: Form) -> None:
     image = np.random.RandomState(0).randint(0, 256, (101, 134, 3)).astype(np.uint8)
     pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
     with torch.inference_mode():
-        np.testing.assert_allclose(net((pixels - 128) / 128)[0].numpy(), expected[1], atol=2e-5)
-        result = describe(net, pixels, SCALES)[0].numpy()
+        unscaled = net.at_one_scale((pixels - 128) / 128)[0].numpy()
+        np.testing.assert_allclose(unscaled, expected[1], atol=2e-5)
+        result = net(pixels)[0].numpy()
     units = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     joined = units.sum(axis=0) / np.linalg.norm(units.sum(axis=0))
     np.testing.assert_allclose(result, joined, atol=1e-6)
@@ -50,9 +51,9 @@ def test_vectors_equal_tensorflow(net: DelgNet, form: Form) -> None:
 
 def test_an_image_too_small_for_the_smallest_scale_is_refused() -> None:
     with torch.device("meta"):
-        net = DelgNet(50, "keras")
+        net = DelgNet(50, "keras", SCALES)
     with pytest.raises(DataError, match=r"an image of 40 x 6 pixels is too small .* at scale 0\.7"):
-        describe(net, torch.zeros(1, 3, 6, 40), SCALES)
+        net(torch.zeros(1, 3, 6, 40))
 
 
 @pytest.mark.parametrize("kind", ["keras", "keras-weights", "slim"])

@@ -125,7 +125,7 @@ def test_apgem_equals_its_steps(apgem_tensors: Tensors) -> None:
     for normalised in (False, True):
         settings["model_options.norm_features"] = torch.tensor(normalised)
         with torch.inference_mode():
-            result = apgem_from(tensors | settings, "w.pt").describe(image).numpy()
+            result = apgem_from(tensors | settings, "w.pt")(image).numpy()
         if normalised:
             pooled /= np.linalg.norm(pooled, axis=1, keepdims=True)
         vectors = pooled @ tensors["fc.weight"].numpy().T + tensors["fc.bias"].numpy()
