@@ -121,21 +121,11 @@ def _activated(
     return nn.Sequential(layer, nn.BatchNorm2d(out), kind(inplace=True))
 
 
-class Pooling(nn.Sequential):
-    """Global average pooling and projection, expanded to the size of the feature map."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        pooled = x
-        for layer in self:
-            pooled = layer(pooled)
-        return pooled.expand(-1, -1, *x.shape[-2:])
-
-
 class AtrousPyramid(nn.Module):
-    """Atrous spatial pyramid pooling: five branches, concatenated and projected."""
+    """Atrous spatial pyramid pooling: five branches, concatenated and projected.
+
+    The last branch is a global average, equal at all pixels.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -143,11 +133,13 @@ class AtrousPyramid(nn.Module):
         branches += [
             _activated(channels, _WIDTH, 3, padding=rate, dilation=rate) for rate in _DILATIONS
         ]
-        self.convs = nn.ModuleList([*branches, Pooling(channels)])
+        whole = nn.Sequential(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
+        self.convs = nn.ModuleList([*branches, whole])
         self.project = _activated(len(self.convs) * _WIDTH, _WIDTH, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.project(torch.cat([branch(x) for branch in self.convs], dim=1))
+        *local, whole = (branch(x) for branch in self.convs)
+        return self.project(torch.cat([*local, whole.expand_as(local[0])], dim=1))
 
 
 class Head(nn.Module):
