@@ -93,10 +93,7 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
                 maps = net(stacked)
             for k, scores, features in zip(usable, *maps, strict=True):
                 levels_of[k].append(self._selected(scores, features, images[0].shape))
-        return [
-            self._best_of_levels(each or [_NOTHING], mask)
-            for each, mask in zip(levels_of, masks, strict=True)
-        ]
+        return self._best_of_levels([levels or [_NOTHING] for levels in levels_of], masks)
 
     def _selected(
         self, score_map: torch.Tensor, features: torch.Tensor, full_size: Sequence[int]

@@ -13,9 +13,9 @@ from pydantic import Field
 
 from megloc_kapture.features.network import (
     Images,
+    Level,
     LocalNetwork,
     LocalNetworkOptions,
-    LocalOptions,
     Masks,
 )
 from megloc_kapture.nets.kornia_networks import (
@@ -31,22 +31,13 @@ _XFEAT_STRIDE_PX = 32  # XFeat rounds image sides down to multiples of 32 pixels
 _ALL = 1 << 30  # detect all keypoints, since the mask is applied before the best are selected
 
 
-class _KorniaFeatures(LocalNetwork[LocalOptions]):
-    name: str
-
-    def __init__(self, options: LocalOptions | None = None) -> None:
-        require_kornia(self.name)
-        super().__init__(options)
-
-    def _of_each(self, detections: Any, masks: Masks, offset_px: Any = 0.5) -> list[LocalFeatures]:
-        features = []
-        for (xy, scores, descriptors), mask in zip(detections, masks, strict=True):
-            values = scores.float().cpu().numpy()
-            # in kornia, the first pixel's centre is (0, 0)
-            table = np.column_stack([xy.cpu().numpy() + offset_px, values]).astype(np.float32)
-            rows_of = descriptors.float().cpu().__getitem__
-            features.append(self._best(table, values, rows_of, mask))
-        return features
+def _level(
+    xy: torch.Tensor, scores: torch.Tensor, descriptors: torch.Tensor, offset_px: Any = 0.5
+) -> Level:
+    values = scores.float().cpu().numpy()
+    # in kornia, the first pixel's centre is (0, 0)
+    table = np.column_stack([xy.cpu().numpy() + offset_px, values]).astype(np.float32)
+    return table, values, descriptors.float()
 
 
 class XFeatOptions(LocalNetworkOptions):
@@ -59,7 +50,7 @@ class XFeatOptions(LocalNetworkOptions):
     )
 
 
-class XFeat(_KorniaFeatures[XFeatOptions]):
+class XFeat(LocalNetwork[XFeatOptions]):
     """The extractor ``xfeat``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 64).
 
     Other descriptor weights define another feature type, named after their file.
@@ -69,6 +60,7 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
     Options = XFeatOptions
 
     def __init__(self, options: XFeatOptions | None = None) -> None:
+        require_kornia(self.name)
         super().__init__(options)
         if self._descriptor_weights is not None:
             self.name = f"xfeat-{self._descriptor_weights.path.stem}"
@@ -85,11 +77,12 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
                     detection["descriptors"] = xfeat_descriptors(
                         other, tensor, detection["keypoints"]
                     )
-        each = (
-            (detection["keypoints"], detection["scores"], detection["descriptors"])
-            for detection in detections
-        )
-        return self._of_each(each, masks, offset_px=xfeat_offset_px(images[0].shape))
+        offset_px = xfeat_offset_px(images[0].shape)
+        levels = [
+            _level(found["keypoints"], found["scores"], found["descriptors"], offset_px)
+            for found in detections
+        ]
+        return self._best_of_levels([[level] for level in levels], masks)
 
 
 def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
@@ -110,11 +103,15 @@ class DiskOptions(LocalNetworkOptions):
     threshold: float = Field(default=0.0, description="smallest score of a keypoint, a logit")
 
 
-class Disk(_KorniaFeatures[DiskOptions]):
+class Disk(LocalNetwork[DiskOptions]):
     """The extractor ``disk``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 128)."""
 
     name = "disk"
     Options = DiskOptions
+
+    def __init__(self, options: DiskOptions | None = None) -> None:
+        require_kornia(self.name)
+        super().__init__(options)
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         options = self.options
@@ -124,8 +121,8 @@ class Disk(_KorniaFeatures[DiskOptions]):
             detections = network(
                 batch, None, options.nms_window_px, options.threshold, pad_if_not_divisible=True
             )
-        each = (
-            (detection.keypoints, detection.detection_scores, detection.descriptors)
-            for detection in detections
-        )
-        return self._of_each(each, masks)
+        levels = [
+            _level(found.keypoints, found.detection_scores, found.descriptors)
+            for found in detections
+        ]
+        return self._best_of_levels([[level] for level in levels], masks)

@@ -62,11 +62,16 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
         return LocalFeatures(table[rows], scores[rows], descriptors, len(table) - len(usable))
 
     def _best_of_levels(
-        self, levels: Sequence[Level], mask: NDArray[np.bool_] | None
-    ) -> LocalFeatures:
-        tables, scores, descriptors = zip(*levels, strict=True)
-        rows_of = torch.cat(descriptors).cpu().__getitem__
-        return self._best(np.concatenate(tables), np.concatenate(scores), rows_of, mask)
+        self, levels_of: Sequence[Sequence[Level]], masks: Masks
+    ) -> list[LocalFeatures]:
+        features = []
+        for levels, mask in zip(levels_of, masks, strict=True):
+            tables, scores, descriptors = zip(*levels, strict=True)
+            rows_of = torch.cat(descriptors).cpu().__getitem__
+            features.append(
+                self._best(np.concatenate(tables), np.concatenate(scores), rows_of, mask)
+            )
+        return features
 
 
 def in_image_px(

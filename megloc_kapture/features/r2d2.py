@@ -103,10 +103,7 @@ class R2D2(LocalNetwork[R2D2Options]):
                     descriptors = functional.normalize(features[:, rows, columns].float(), dim=0).T
                     table = np.column_stack([xy_px, np.full(len(xy_px), scale)])
                     of_image.append((table, scores.cpu().numpy(), descriptors))
-        return [
-            self._best_of_levels(levels, mask)
-            for levels, mask in zip(levels_of, masks, strict=True)
-        ]
+        return self._best_of_levels(levels_of, masks)
 
 
 class R2D2Network(nn.Module):
