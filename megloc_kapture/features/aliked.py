@@ -207,39 +207,38 @@ class _Block(nn.Module):
         self, inputs: int, outputs: int, *, deformable: bool, residual: bool = True
     ) -> None:
         super().__init__()
-        kind = _DeformableConv if deformable else _Conv
-        self.conv1 = kind(inputs, outputs)
+        make = _deformable_conv if deformable else _conv
+        self.conv1 = make(inputs, outputs)
         self.bn1 = nn.BatchNorm2d(outputs)
-        self.conv2 = kind(outputs, outputs)
+        self.conv2 = make(outputs, outputs)
         self.bn2 = nn.BatchNorm2d(outputs)
         self.downsample = nn.Conv2d(inputs, outputs, 1) if residual else None
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        inner = functional.selu(self.conv1.normalised(x, self.bn1), inplace=True)
-        result = self.conv2.normalised(inner, self.bn2)
+        inner = functional.selu(_normalised(x, self.conv1, self.bn1), inplace=True)
+        result = _normalised(inner, self.conv2, self.bn2)
         if self.downsample is not None:
             result = result + self.downsample(x)
         return functional.selu(result, inplace=True)
 
 
-class _Conv(nn.Conv2d):
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(inputs, outputs, 3, padding=1, bias=False)
-
-    def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
-        return functional.conv2d(x, *with_norm(self.weight, norm), padding=1)
+def _conv(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
 
 
-class _DeformableConv(nn.Module):
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.offset_conv = nn.Conv2d(inputs, 18, 3, padding=1)
-        self.regular_conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+def _deformable_conv(inputs: int, outputs: int) -> nn.ModuleDict:
+    offset = nn.Conv2d(inputs, 18, 3, padding=1)
+    return nn.ModuleDict({"offset_conv": offset, "regular_conv": _conv(inputs, outputs)})
 
-    def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
-        limit = max(x.shape[2:]) / 4
-        offset = self.offset_conv(x).clamp(-limit, limit)
-        return deform_conv2d(x, offset, *with_norm(self.regular_conv.weight, norm))
+
+def _normalised(
+    x: torch.Tensor, conv: nn.Conv2d | nn.ModuleDict, norm: nn.BatchNorm2d
+) -> torch.Tensor:
+    if isinstance(conv, nn.Conv2d):
+        return functional.conv2d(x, *with_norm(conv.weight, norm), padding=1)
+    limit = max(x.shape[2:]) / 4
+    offset = conv["offset_conv"](x).clamp(-limit, limit)
+    return deform_conv2d(x, offset, *with_norm(conv.get_parameter("regular_conv.weight"), norm))
 
 
 def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
