@@ -125,7 +125,10 @@ def gray_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
 
 
 class SuperPointNet(nn.Module):
-    """Network from gray image to scores per pixel and descriptors per cell of 8 x 8 pixels."""
+    """Network from gray image to scores per pixel and descriptors per cell of 8 x 8 pixels.
+
+    ``describer`` is another network that computes the descriptors, if any.
+    """
 
     official_sampling: DescriptorSampling = "official"
 
@@ -141,6 +144,7 @@ class SuperPointNet(nn.Module):
         if descriptor:
             self.convDa = _conv3(128, 256)
             self.convDb = nn.Conv2d(256, DESCRIPTOR_SIZE, kernel_size=1)
+        self.describer: SuperPointNet | None = None
 
     def encode(self, gray: torch.Tensor) -> torch.Tensor:
         """Compute features (B, 128, H // 8, W // 8) of images (B, 1, H, W) in [0, 1]."""
@@ -173,25 +177,15 @@ class SuperPointNet(nn.Module):
         ``gray`` (B, 1, H, W) is in [0, 1]; h = H // 8, w = W // 8.
         """
         features = self.encode(gray)
-        return self.detect(features), self.describe(features)
-
-
-class SplitSuperPoint(nn.Module):
-    official_sampling: DescriptorSampling = "official"
-
-    def __init__(self, detector: SuperPointNet, descriptor: SuperPointNet) -> None:
-        super().__init__()
-        self.detector = detector
-        self.descriptor = descriptor
-
-    def forward(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        scores = self.detector.detect(self.detector.encode(gray))
-        return scores, self.descriptor.describe(self.descriptor.encode(gray))
+        scores = self.detect(features)
+        if self.describer is None:
+            return scores, self.describe(features)
+        return scores, self.describer.describe(self.describer.encode(gray))
 
 
 def superpoint_from(
     tensors: Mapping[str, torch.Tensor], where: str, descriptor_weights: WeightsFile | None = None
-) -> SuperPointNet | SplitSuperPoint | SuperPointBatchNormNet:
+) -> SuperPointNet | SuperPointBatchNormNet:
     """Build the network of a checkpoint in either layout, with optional descriptor weights."""
     if any(key.startswith("backbone.") for key in tensors):
         if descriptor_weights is not None:
@@ -217,7 +211,7 @@ def superpoint_with_descriptor(
     *,
     detector_where: str,
     descriptor_where: str,
-) -> SuperPointNet | SplitSuperPoint:
+) -> SuperPointNet:
     """Combine the detector of one checkpoint with the descriptors of another.
 
     A descriptor head without a backbone uses the detector's features.
@@ -226,8 +220,8 @@ def superpoint_with_descriptor(
     frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}
     detects = load_strictly(SuperPointNet(descriptor=False), frozen, detector_where)
     if any(key.startswith(("conv1", "conv2", "conv3", "conv4")) for key in head):
-        describes = load_strictly(SuperPointNet(detector=False), head, descriptor_where)
-        return SplitSuperPoint(detects, describes)
+        detects.describer = load_strictly(SuperPointNet(detector=False), head, descriptor_where)
+        return detects
     return load_strictly(SuperPointNet(), {**frozen, **head}, descriptor_where)
 
 
