@@ -41,7 +41,6 @@ from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.pairs import TrainingPair
 from megloc_kapture.values import ImageFeatures, RigidTransform
 
-_FEATURES_KEPT = 1024  # number of images whose features are cached
 _FIRST_SCALE = 10.0  # initial scale of descriptor products
 _FIRST_DUSTBIN = 0.7  # initial cosine of the dustbin
 _CONFIDENT = 0.2  # SuperGlue's threshold on the scores of matches
@@ -61,32 +60,6 @@ class PreparedPair:
     @property
     def usable(self) -> bool:
         return all(len(image.keypoints_px) > 0 for image in self.features)
-
-
-class FrozenFeatures:
-    """Best keypoints of an extractor; those of images with a key are cached."""
-
-    def __init__(self, extractor: LocalFeatureExtractor, max_keypoints: int) -> None:
-        self.extractor, self._max_keypoints = extractor, max_keypoints
-        self._kept: dict[str, ImageFeatures] = {}
-
-    def prepare(self, pair: TrainingPair) -> PreparedPair:
-        keys = pair.keys or (None, None)
-        a, b = (self._of(image, key) for image, key in zip(pair.images, keys, strict=True))
-        labels = pair.label(a.keypoints_px[:, :2], b.keypoints_px[:, :2])
-        return PreparedPair(pair, (a, b), labels)
-
-    def _of(self, image: Image, key: str | None) -> ImageFeatures:
-        if key is not None and key in self._kept:
-            return self._kept[key]
-        extracted, best = self.extractor.extract(image), slice(self._max_keypoints)
-        height, width = image.shape[:2]
-        features = ImageFeatures(
-            extracted.keypoints_px[best], extracted.descriptors[best], width, height
-        )
-        if key is not None and len(self._kept) < _FEATURES_KEPT:
-            self._kept[key] = features
-        return features
 
 
 class SuperPointDescriber(nn.Module):

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from safetensors.torch import save
 
@@ -37,7 +38,6 @@ from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, Plugin
 from megloc_kapture.stages.work import HERE, Work, ordered_map
 from megloc_kapture.training.networks import (
     AUC_DEG,
-    FrozenFeatures,
     HeldOutResult,
     PairModel,
     PreparedPair,
@@ -47,12 +47,14 @@ from megloc_kapture.training.networks import (
     encoder_sizes,
     held_out_result,
 )
-from megloc_kapture.training.pairs import PairSource, Photographs, PosedPairs
+from megloc_kapture.training.pairs import PairSource, Photographs, PosedPairs, TrainingPair
+from megloc_kapture.values import ImageFeatures
 
 COLUMNS = (
     *("step", "learning_rate", "loss", "held_out_loss", "precision", "recall"),
     *(f"auc_{bound}" for bound in AUC_DEG),
 )
+_FEATURES_KEPT = 1024  # number of images whose features are cached
 _LAST_RATE = 0.01  # relative to the initial rate
 _MAX_GRADIENT = 1.0  # norm
 
@@ -138,7 +140,7 @@ class Trainer:
         self.rows: list[list[float]] = []
         choice = options.features
         self.extractor = load_plugin(LOCAL_FEATURES, choice.name, choice.options)
-        self._frozen = FrozenFeatures(self.extractor, options.max_keypoints)
+        self._kept: dict[str, ImageFeatures] = {}
         self._device = pick_device(options.device)
         self.model = model_of(options, self.extractor).to(self._device)
         trained = [p for p in self.model.parameters() if p.requires_grad]
@@ -178,7 +180,7 @@ class Trainer:
         """Draw the evaluation pairs of each source."""
         self._held_out = {
             name: [
-                self._frozen.prepare(source.draw(np.random.default_rng([0, number])))
+                self.prepare(source.draw(np.random.default_rng([0, number])))
                 for number in range(self.options.held_out_pairs)
             ]
             for name, source in sources.items()
@@ -224,8 +226,28 @@ class Trainer:
         for number in range(self.options.pairs_per_step):
             rng = np.random.default_rng([self.options.seed, step, number])
             source = sources[int(rng.integers(len(sources)))]
-            batch.append(self._frozen.prepare(source.draw(rng)))
+            batch.append(self.prepare(source.draw(rng)))
         return batch
+
+    def prepare(self, pair: TrainingPair) -> PreparedPair:
+        """Extract and label a pair's best keypoints."""
+        keys = pair.keys or (None, None)
+        a, b = (self._features(image, key) for image, key in zip(pair.images, keys, strict=True))
+        labels = pair.label(a.keypoints_px[:, :2], b.keypoints_px[:, :2])
+        return PreparedPair(pair, (a, b), labels)
+
+    def _features(self, image: NDArray[np.uint8], key: str | None) -> ImageFeatures:
+        """Return the best features of an image; those with a key are cached."""
+        if key is not None and key in self._kept:
+            return self._kept[key]
+        extracted, best = self.extractor.extract(image), slice(self.options.max_keypoints)
+        height, width = image.shape[:2]
+        features = ImageFeatures(
+            extracted.keypoints_px[best], extracted.descriptors[best], width, height
+        )
+        if key is not None and len(self._kept) < _FEATURES_KEPT:
+            self._kept[key] = features
+        return features
 
 
 TASKS: dict[str, type[TrainingOptions]] = {

@@ -30,7 +30,6 @@ from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet
 from megloc_kapture.stages.work import Work
 from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.networks import (
-    FrozenFeatures,
     PairModel,
     PreparedPair,
     ProductHead,
@@ -328,8 +327,7 @@ def test_xfeat_keeps_its_statistics(files: dict[str, str]) -> None:
 
 
 def test_frozen_features_are_the_best_and_kept(files: dict[str, str]) -> None:
-    extractor = extractors(files)[0]
-    frozen = FrozenFeatures(extractor, 20)
+    trainer = Trainer(options(files, max_keypoints=20))
     images = texture(96, 128), texture(80, 96, 1)
     labelled: list[tuple[int, int]] = []
 
@@ -337,21 +335,21 @@ def test_frozen_features_are_the_best_and_kept(files: dict[str, str]) -> None:
         labelled.append((len(px_a), len(px_b)))
         return NOTHING
 
-    first = frozen.prepare(TrainingPair(images, ("a", "b"), label))
+    first = trainer.prepare(TrainingPair(images, ("a", "b"), label))
     assert labelled == [(20, 20)]
     a, b = first.features
-    result = extractor.extract(images[0])
+    result = trainer.extractor.extract(images[0])
     np.testing.assert_array_equal(a.keypoints_px, result.keypoints_px[:20])
-    again = frozen.prepare(TrainingPair(images, ("b", "c"), label))
+    again = trainer.prepare(TrainingPair(images, ("b", "c"), label))
     assert again.features[0] is b and again.features[1] is not b
-    assert frozen.prepare(TrainingPair(images, None, label)).features[0] is not a
+    assert trainer.prepare(TrainingPair(images, None, label)).features[0] is not a
 
 
 def test_a_pair_without_keypoints_has_no_loss(files: dict[str, str]) -> None:
     blank = np.zeros((64, 64, 3), np.uint8)
-    options = SuperPointOptions(weights=files["superpoint"], device="cpu", threshold=0.9)
-    frozen = FrozenFeatures(SuperPoint(options), 10)
-    pair = frozen.prepare(TrainingPair((blank, blank), None, lambda a, b: NOTHING))
+    chosen = {"weights": files["superpoint"], "device": "cpu", "threshold": 0.9}
+    trainer = Trainer(options(files, features={"name": "superpoint", "options": chosen}))
+    pair = trainer.prepare(TrainingPair((blank, blank), None, lambda a, b: NOTHING))
     model = PairModel(SuperGlueNet(encoder_sizes(256), 2), None, iterations=5)
     loss = model([pair])
     loss.backward()
