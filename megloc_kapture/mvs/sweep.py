@@ -22,7 +22,13 @@ from pydantic import Field
 
 from megloc_kapture.errors import PluginError
 from megloc_kapture.geometry.cameras import scaled_camera
-from megloc_kapture.mvs.views import Projections, pinhole_matrix, pixel_step, relative_projection
+from megloc_kapture.mvs.views import (
+    Projections,
+    pinhole_matrix,
+    pixel_step,
+    reduced_view,
+    relative_projection,
+)
 from megloc_kapture.plugins import DepthEstimate, StereoView
 from megloc_kapture.values import Camera, Options
 
@@ -72,7 +78,8 @@ class Sweep:
     ) -> DepthEstimate:
         near, far = depth_range_m
         limits = np.array([1.0 / far, 1.0 / near])
-        half = [_halved(view) for view in (reference, *sources)]
+        views = (reference, *sources)
+        half = [reduced_view(view, scaled_camera(view.camera, 0.5)) for view in views]
         inverse, step = sweep(half[0], half[1:], limits, self.options.max_planes)
         size = reference.camera.width, reference.camera.height
         planes = tangent_planes(cv2.resize(inverse, size, interpolation=cv2.INTER_LINEAR))
@@ -166,15 +173,6 @@ def stereo_image(view: StereoView) -> Image:
     if view.mask is not None:
         grey[~view.mask] = np.nan
     return grey
-
-
-def _halved(view: StereoView) -> StereoView:
-    camera = scaled_camera(view.camera, 0.5)
-    size, mask = (camera.width, camera.height), view.mask
-    image = np.asarray(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if mask is not None:
-        mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-    return StereoView(image, camera, view.cam_from_world, mask)
 
 
 def sweep(

@@ -85,16 +85,10 @@ def stereo_view(
 ) -> StereoView:
     """Undistort an image for stereo; mask bool (H, W), True = use."""
     pinhole = stereo_camera(camera, max_size_px)
-    size = pinhole.width, pinhole.height
     if camera.model in PINHOLE_MODELS:
-        small = image
-        if size != (camera.width, camera.height):
-            small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        if mask is not None:
-            mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-        return StereoView(small, pinhole, cam_from_world, mask)
+        return reduced_view(StereoView(image, camera, cam_from_world, mask), pinhole)
     # reduce first, to avoid aliasing
-    lens = reduced_camera(camera, max(size))
+    lens = reduced_camera(camera, max(pinhole.width, pinhole.height))
     x, y = _undistortion(lens, pinhole)
     reduced = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
     small = np.asarray(cv2.remap(reduced, x, y, cv2.INTER_LINEAR), np.uint8)
@@ -103,6 +97,16 @@ def stereo_view(
     allowed = np.asarray(cv2.resize(allowed, size, interpolation=cv2.INTER_AREA), np.float32)
     seen = np.asarray(cv2.remap(allowed, x, y, cv2.INTER_LINEAR) > 0.999)
     return StereoView(small, pinhole, cam_from_world, None if seen.all() else seen)
+
+
+def reduced_view(view: StereoView, camera: Camera) -> StereoView:
+    """Reduce image and mask to the size of a camera."""
+    size, image, mask = (camera.width, camera.height), view.image, view.mask
+    if size != (view.camera.width, view.camera.height):
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        if mask is not None:
+            mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    return StereoView(image, camera, view.cam_from_world, mask)
 
 
 def _undistortion(lens: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], ...]:
