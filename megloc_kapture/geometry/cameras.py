@@ -138,6 +138,21 @@ def in_image(camera: Camera, px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]
         return np.asarray(((px >= 0) & (px < (camera.width, camera.height))).all(axis=1))
 
 
+def values_at(
+    image: NDArray[Any], camera: Camera, points_in_cam: NDArray[np.float64], outside: float
+) -> NDArray[Any]:
+    """Return the values (N,) of an image (H, W) at the pixels of points (N, 3) in its camera.
+
+    Points that project outside the image get the value ``outside``.
+    """
+    px = px_from_cam(camera, points_in_cam)
+    inside = in_image(camera, px)
+    column, row = px[inside].astype(np.int64).T
+    values = np.full(len(px), outside, image.dtype)
+    values[inside] = image[row, column]
+    return values
+
+
 # a, b, c of a Kinect's depth noise a + b z + c z^2 = 0.0012 + 0.0019 (z - 0.4)^2
 STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 

@@ -19,8 +19,7 @@ from megloc_kapture.geometry.cameras import (
     STRUCTURED_LIGHT,
     depth_noise,
     focal_px,
-    in_image,
-    px_from_cam,
+    values_at,
 )
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.plugins import DepthView, PoseRefinement, RankingScene
@@ -334,7 +333,9 @@ def _overlaps(
             continue
         points = depth_cloud(view, options.depth, step_px=_OVERLAP_STEP_PX)
         seen = (depth_from_world @ scene.map_pose(name).inverse()).apply(points)
-        agrees = _agrees(query_depth, seen, options.max_distances_m[0])
+        depth = values_at(query_depth.depth_m, query_depth.camera, seen, outside=0.0)
+        with np.errstate(invalid="ignore"):
+            agrees = (depth > 0) & (np.abs(seen[:, 2] - depth) <= options.max_distances_m[0])
         shares.append((name, float(agrees.mean()) if len(agrees) else 0.0))
     return sorted(shares, key=lambda each: -each[1])
 
@@ -355,18 +356,6 @@ def _different_views(
         names.append(name)
         quats, centers = np.vstack([quats, quat]), np.vstack([centers, center])
     return names
-
-
-def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDArray[np.bool_]:
-    pixels = px_from_cam(view.camera, points_in_depth)
-    inside = in_image(view.camera, pixels)
-    column, row = pixels[inside].astype(np.int64).T
-    depth = view.depth_m[row, column].astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        near = (depth > 0) & (np.abs(points_in_depth[inside, 2] - depth) <= tolerance_m)
-    agrees = np.zeros(len(points_in_depth), bool)
-    agrees[inside] = near
-    return agrees
 
 
 class Icp:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import in_image, pixel_rays, px_from_cam
+from megloc_kapture.geometry.cameras import pixel_rays, values_at
 from megloc_kapture.geometry.poses import deviation_by_median
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
@@ -72,7 +72,7 @@ def depth_cloud(
     )
     if image_camera is None or image_mask is None:
         return points
-    return points[~_hidden(points, image_camera, image_mask)]
+    return points[values_at(image_mask, image_camera, points, outside=True)]
 
 
 def _on_edge(
@@ -88,15 +88,6 @@ def _on_edge(
             # pixels without depth (0, NaN) do not count as edges
             edge |= (other > limit * z) | ((other > 0) & (limit * other < z))
     return edge
-
-
-def _hidden(points: Floats, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    pixels = px_from_cam(camera, points)
-    inside = in_image(camera, pixels)
-    column, row = pixels[inside].astype(np.int64).T
-    hidden = np.zeros(len(points), bool)
-    hidden[inside] = ~mask[row, column]
-    return hidden
 
 
 @dataclass(frozen=True, eq=False)
