@@ -196,8 +196,10 @@ class Block(nn.Module):
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
+        self.heads = heads
         self.norm1 = nn.LayerNorm(channels, eps=_EPSILON)
-        self.attn = Attention(channels, heads)
+        qkv, proj = nn.Linear(channels, 3 * channels), nn.Linear(channels, channels)
+        self.attn = nn.ModuleDict({"qkv": qkv, "proj": proj})
         self.ls1 = nn.ParameterDict({"gamma": torch.ones(channels)})
         self.norm2 = nn.LayerNorm(channels, eps=_EPSILON)
         fc1, fc2 = (
@@ -208,20 +210,12 @@ class Block(nn.Module):
         self.ls2 = nn.ParameterDict({"gamma": torch.ones(channels)})
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        tokens = tokens + self.ls1["gamma"] * self.attn(self.norm1(tokens))
+        tokens = tokens + self.ls1["gamma"] * self._attended(self.norm1(tokens))
         return tokens + self.ls2["gamma"] * self.mlp(self.norm2(tokens))
 
-
-class Attention(nn.Module):
-    def __init__(self, channels: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.qkv = nn.Linear(channels, 3 * channels)
-        self.proj = nn.Linear(channels, channels)
-
-    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+    def _attended(self, tokens: torch.Tensor) -> torch.Tensor:
         # (B, N, 3, heads, C / heads) -> three times (B, heads, N, C / heads)
-        parts = self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        parts = self.attn["qkv"](tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         query, key, value = parts.unbind(0)
         read = functional.scaled_dot_product_attention(query, key, value)
-        return self.proj(read.transpose(1, 2).flatten(2))
+        return self.attn["proj"](read.transpose(1, 2).flatten(2))
