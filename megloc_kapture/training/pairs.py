@@ -81,7 +81,8 @@ class PosedPairs:
             near, overlaps = self._read_overlaps(measured)
         else:
             near = pairs_by_poses([poses[name] for name in self._names], _CANDIDATES)
-            shares = work.track((self._overlap(i, j) for i, j in near), len(near), "overlap")
+            views = ((self._view(self._names[i]), self._view(self._names[j])) for i, j in near)
+            shares = work.track((overlap(a, b) for a, b in views), len(near), "overlap")
             overlaps = np.fromiter(shares, np.float64, len(near))
         if not len(near):
             raise DataError(
@@ -109,12 +110,13 @@ class PosedPairs:
     def draw(self, rng: np.random.Generator) -> TrainingPair:
         pairs = self._bins[rng.integers(len(self._bins))]
         names = [self._names[row] for row in rng.permuted(pairs[rng.integers(len(pairs))])]
+        paths = [self._kapture.image_path(name) for name in names]
         a, b = (self._view(name) for name in names)
         images = [
-            resized(read_image_rgb(self._kapture.image_path(name)), *_size(view))
-            for name, view in zip(names, (a, b), strict=True)
+            resized(read_image_rgb(path), view.camera.width, view.camera.height)
+            for path, view in zip(paths, (a, b), strict=True)
         ]
-        keys = (str(self._kapture.image_path(names[0])), str(self._kapture.image_path(names[1])))
+        keys = str(paths[0]), str(paths[1])
         label = partial(labels_of_views, a=a, b=b)
         return TrainingPair((images[0], images[1]), keys, label, (a, b))
 
@@ -127,10 +129,6 @@ class PosedPairs:
         rows = [(row_of[pair.query], row_of[pair.map]) for pair in pairs]
         near = np.array(rows, np.int64).reshape(-1, 2)
         return near, np.array([pair.score for pair in pairs], np.float64)
-
-    def _overlap(self, first: int, second: int) -> float:
-        a, b = self._view(self._names[first]), self._view(self._names[second])
-        return overlap(a, b)
 
     def _read_view(self, name: str) -> PosedView:
         camera, depth = self._kapture.read().camera_of(name), depth_of(self._kapture, name)
@@ -163,10 +161,6 @@ class Photographs:
 
 
 PairSource = PosedPairs | Photographs
-
-
-def _size(view: PosedView) -> tuple[int, int]:
-    return view.camera.width, view.camera.height
 
 
 def random_view(
