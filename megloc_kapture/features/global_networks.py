@@ -8,7 +8,7 @@ et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -40,14 +40,13 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
     """Base of global features; the type name contains the method and the checkpoint's name."""
 
     name: str
-    method: ClassVar[str]
     _load: Any
     _load_with: tuple[Any, ...] = ()
 
     def __init__(self, options: GlobalOptions | None = None) -> None:
         super().__init__(options)
-        stem = Path(self._weights.name.removesuffix(".gz")).stem
-        self.name = stem if self.method in stem else f"{self.method}-{stem}"
+        method, stem = self.name, Path(self._weights.name.removesuffix(".gz")).stem
+        self.name = stem if method in stem else f"{method}-{stem}"
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the unit-norm descriptor float32 (D,) of an RGB image uint8 (H, W, 3)."""
@@ -79,7 +78,7 @@ class NetVladOptions(NetworkOptions):
 class NetVlad(GlobalNetwork[NetVladOptions]):
     """NetVLAD on VGG-16 with whitening: unit-norm float32 (4096,)."""
 
-    name = method = "netvlad"
+    name = "netvlad"
     Options = NetVladOptions
     _load = staticmethod(netvlad)
 
@@ -97,7 +96,7 @@ class OpenIblOptions(NetworkOptions):
 class OpenIbl(GlobalNetwork[OpenIblOptions]):
     """OpenIBL's VGG-16 with NetVLAD and PCA: unit-norm float32 (4096,)."""
 
-    name = method = "openibl"
+    name = "openibl"
     Options = OpenIblOptions
     _load = staticmethod(openibl)
 
@@ -144,7 +143,7 @@ class ApGemOptions(NetworkOptions):
 class ApGem(GlobalNetwork[ApGemOptions]):
     """AP-GeM: unit-norm float32 (2048,); checkpoint, whitening and power are in the type name."""
 
-    name = method = "apgem"
+    name = "apgem"
     Options = ApGemOptions
     _load = staticmethod(apgem_from)
 
@@ -173,7 +172,7 @@ class DelgOptions(NetworkOptions):
 class Delg(GlobalNetwork[DelgOptions]):
     """DELG's global descriptors: unit-norm float32 (2048,)."""
 
-    name = method = "delg"
+    name = "delg"
     Options = DelgOptions
     _load = staticmethod(delg_from)
 
@@ -201,7 +200,7 @@ class MegaLocOptions(NetworkOptions):
 class MegaLoc(GlobalNetwork[MegaLocOptions]):
     """MegaLoc on an image resized to a square, as in the paper: unit-norm float32 (8448,)."""
 
-    name = method = "megaloc"
+    name = "megaloc"
     Options = MegaLocOptions
     _load = staticmethod(megaloc_from)
 
