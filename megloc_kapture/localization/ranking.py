@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from itertools import islice
 from typing import NamedTuple
 
 import cv2
@@ -279,12 +280,8 @@ def aligned_view(
     source_of: Callable[[str], PosedImage | None],
 ) -> WarpedView:
     """Warp the map images with depth that are nearest to a pose into its view, at reduced size."""
-    sources: list[PosedImage] = []
-    for name in _nearest_first(images, cam_from_world, scene):
-        if len(sources) == options.references:
-            break
-        if (source := source_of(name)) is not None:
-            sources.append(source)
+    found = filter(None, map(source_of, _nearest_first(images, cam_from_world, scene)))
+    sources = list(islice(found, options.references))
     scale = min(1.0, options.long_side / max(camera.width, camera.height))
     return warp_to_view(sources, camera, cam_from_world, scale=scale)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,12 +206,8 @@ class Rendering:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        used: list[PosedImage] = []
-        for name in references:
-            if len(used) == self.options.max_references:
-                break
-            if (reference := image_with_depth(name, scene)) is not None:
-                used.append(reference)
+        found = filter(None, (image_with_depth(name, scene) for name in references))
+        used = list(islice(found, self.options.max_references))
         if not used:
             return PoseRefinement(cam_from_world, "no reference image has depth")
         image, mask = scene.query_image(query), scene.query_mask(query)
