@@ -93,9 +93,7 @@ def generate(street: Street, folder: Path) -> None:
             with open(descriptors / f"{name}.desc", "wb") as file:
                 file.truncate(NUM_KEYPOINTS * described.dsize * described.dtype.itemsize)
     images, rows, points = street.observations()
-    observed = Observations(
-        KEYPOINTS_TYPE, street.names, points, images.astype(np.int32), rows.astype(np.int32)
-    )
+    observed = Observations(street.names, points, images.astype(np.int32), rows.astype(np.int32))
     # written last, as a marker of a complete map
     write_observations(folder, {KEYPOINTS_TYPE: observed})
 

@@ -290,7 +290,7 @@ def write_kapture(street: Street, queries: Sequence[Query], folder: Path) -> Non
     write_sensors(folder / "query", KaptureData({"camera": sensor}, {}, {}, query_records, {}))
     images, keypoints, points = street.observations()
     observed = Observations(
-        KEYPOINTS_TYPE, street.names, points, images.astype(np.int32), keypoints.astype(np.int32)
+        street.names, points, images.astype(np.int32), keypoints.astype(np.int32)
     )
     write_points3d(folder, street.xyz)
     write_observations(folder, {KEYPOINTS_TYPE: observed})

@@ -43,7 +43,6 @@ def generate(folder: Path, num_points: int, num_observations: int) -> tuple[floa
         f"sequences/session_{i * 7 // num_images}/frame_{i:06d}.jpg" for i in range(num_images)
     )
     observations = Observations(
-        KEYPOINTS_TYPE,
         names,
         np.sort(rng.integers(0, num_points, num_observations)),
         rng.integers(0, num_images, num_observations).astype(np.int32),

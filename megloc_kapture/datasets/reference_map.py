@@ -218,7 +218,6 @@ def write_reference_map(
             _write_descriptors(source, output, feature_type, lengths, sources)
     kept = np.flatnonzero(keypoint_ids >= 0)
     observations = Observations(
-        keypoints_type,
         names,
         points.point_ids[kept],
         new_ids[points.image_ids[kept]],

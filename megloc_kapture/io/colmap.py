@@ -172,21 +172,6 @@ class MapImage:
     keypoints_px: NDArray[np.floating]
 
 
-@dataclass(frozen=True, eq=False)
-class TriangulatedPoints:
-    """Points float64 (N, 3) in the world frame, mean reprojection errors (N,) and observations.
-
-    Each observation refers to a point, an image and a keypoint of this image by row, int64 (O,)
-    each. Observations are sorted by point, then image, then keypoint.
-    """
-
-    xyz: NDArray[np.float64]
-    errors_px: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
-    image_ids: NDArray[np.int64]
-    keypoint_ids: NDArray[np.int64]
-
-
 def triangulate(
     images: Sequence[MapImage],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
@@ -194,16 +179,18 @@ def triangulate(
     *,
     num_threads: int = 1,
     scratch: Path | None = None,
-) -> TriangulatedPoints:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Triangulate verified matches between images with fixed poses and cameras.
+
+    Return points (N, 3) in the world frame, their mean reprojection errors in pixels (N,), and
+    their observations (O, 3): rows of a point, an image and a keypoint of this image, sorted.
 
     ``matches`` are (M, 2) keypoint rows of pairs (i, j) of images. The world is centred on the
     cameras while COLMAP works, so that maps far from the origin (ECEF) lose no digits.
     """
     options = options or TriangulationOptions()
-    empty = np.zeros(0, dtype=np.int64)
     if not images:
-        return TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), empty, empty, empty)
+        return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3), np.int64)
     for (i, j), pairs in matches.items():
         both = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
         require(
@@ -350,22 +337,19 @@ def _posed_reconstruction(
     return reconstruction
 
 
-def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPoints:
+def _collect(
+    reconstruction: Any, offset: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     # sorted by track, because COLMAP's order of points depends on its threads
     tracks = [
         (sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements), point)
         for _, point in sorted(reconstruction.points3D.items())
     ]
     tracks.sort(key=lambda pair: pair[0])
-    lengths = np.array([len(track) for track, _ in tracks], dtype=np.int64)
-    flat = np.array([e for track, _ in tracks for e in track], dtype=np.int64).reshape(-1, 2)
-    return TriangulatedPoints(
-        xyz=np.array([p.xyz for _, p in tracks], dtype=np.float64).reshape(-1, 3) + offset,
-        errors_px=np.array([p.error for _, p in tracks], dtype=np.float64),
-        point_ids=np.repeat(np.arange(len(tracks), dtype=np.int64), lengths),
-        image_ids=flat[:, 0],
-        keypoint_ids=flat[:, 1],
-    )
+    seen = [(row, *e) for row, (track, _) in enumerate(tracks) for e in track]
+    xyz = np.array([p.xyz for _, p in tracks], dtype=np.float64).reshape(-1, 3) + offset
+    errors_px = np.array([p.error for _, p in tracks], dtype=np.float64)
+    return xyz, errors_px, np.array(seen, dtype=np.int64).reshape(-1, 3)
 
 
 def write_model(

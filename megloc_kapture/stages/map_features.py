@@ -44,7 +44,7 @@ def move_points(
     Only keypoints that observe a point are kept; points without observations are dropped.
     """
     seen = model.observations()[local_type]
-    moved, rows_of, num_found = _moved(model, mapping, seen)
+    moved, rows_of, num_found = _moved(model, mapping, local_type, seen)
     require(
         num_found >= _MIN_FOUND_AGAIN * len(seen),
         f"the model has no descriptors, and extracting {local_type} again finds keypoints "
@@ -73,14 +73,13 @@ def move_points(
 
 
 def _moved(
-    reference: KaptureFolder, mapping: KaptureFolder, seen: Observations
+    reference: KaptureFolder, mapping: KaptureFolder, local_type: str, seen: Observations
 ) -> tuple[Observations, dict[str, NDArray[np.int64]], int]:
     """Transfer observations to all extracted keypoints at the same position (one per orientation).
 
     Return the new observations, the rows of the kept keypoints by image, and the number of stored
     observations that were transferred. The new keypoint ids are positions among the kept rows.
     """
-    local_type = seen.keypoints_type
     stored, extracted = reference.keypoints(local_type), mapping.keypoints(local_type)
     order = np.argsort(seen.image_ids, kind="stable")
     ends = np.cumsum(np.bincount(seen.image_ids, minlength=len(seen.image_names)))

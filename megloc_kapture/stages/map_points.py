@@ -76,20 +76,20 @@ def triangulate_map(
             for image in images
         ]
         verified = matches_of(mapping.matches(name), images, matched)
-        triangulated = triangulate(
+        type_xyz, type_errors_px, seen = triangulate(
             views, verified, options, num_threads=num_threads, scratch=output.absolute()
         )
+        point_ids, image_ids, keypoint_ids = seen.T
         observations[name] = Observations(
-            keypoints_type=name,
             image_names=tuple(images),
-            point_ids=triangulated.point_ids + len(xyz),
-            image_ids=triangulated.image_ids.astype(np.int32),
-            keypoint_ids=triangulated.keypoint_ids.astype(np.int32),
+            point_ids=point_ids + len(xyz),
+            image_ids=image_ids.astype(np.int32),
+            keypoint_ids=keypoint_ids.astype(np.int32),
         )
-        xyz = np.concatenate([xyz, triangulated.xyz])
-        errors_px = np.concatenate([errors_px, triangulated.errors_px])
-        by_type[f"points_{name}"] = len(triangulated.xyz)
-        by_type[f"observations_{name}"] = len(triangulated.point_ids)
+        xyz = np.concatenate([xyz, type_xyz])
+        errors_px = np.concatenate([errors_px, type_errors_px])
+        by_type[f"points_{name}"] = len(type_xyz)
+        by_type[f"observations_{name}"] = len(seen)
     if not len(xyz):
         raise DataError(
             f"no point could be triangulated: {sum(map(len, of_type.values()))} of the image pairs "
@@ -167,7 +167,6 @@ def lift_map(
             keypoint_ids.append(ids)
         keypoints = np.concatenate(keypoint_ids)
         seen[local_type] = Observations(
-            keypoints_type=local_type,
             image_names=tuple(images),
             point_ids=total + np.arange(len(keypoints)),
             image_ids=np.concatenate(image_ids),

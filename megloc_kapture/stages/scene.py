@@ -55,7 +55,7 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
             path=folder.root,
         )
         nothing = np.zeros(0, np.int32)
-        observations = Observations(local_type, (), nothing.astype(np.int64), nothing, nothing)
+        observations = Observations((), nothing.astype(np.int64), nothing, nothing)
     points = folder.points3d()
     index = MapIndex.build(
         points[:, :3],

@@ -123,7 +123,6 @@ def write_points(
         keypoint_ids = [of_image.keypoint_ids.astype(np.int32) for _, of_image in new]
         count = sum(map(len, keypoint_ids))
         observations[local_type] = Observations(
-            local_type,
             names,
             np.concatenate([seen.point_ids, total + np.arange(count)]),
             np.concatenate(image_ids),

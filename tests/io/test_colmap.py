@@ -17,7 +17,6 @@ from poses import rigid
 from megloc_kapture.errors import OutputError
 from megloc_kapture.io.colmap import (
     MapImage,
-    TriangulatedPoints,
     TriangulationOptions,
     load_pycolmap,
     px_from_cam,
@@ -28,6 +27,7 @@ from megloc_kapture.io.colmap_mapping import connected_models
 from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]
+Triangulated = tuple[Array, Array, NDArray[np.int64]]
 Matches = dict[tuple[int, int], NDArray[np.int64]]
 MIXED = [CAMERAS[model] for model in ("PINHOLE", "SIMPLE_RADIAL", "OPENCV_FISHEYE")]
 
@@ -56,69 +56,67 @@ def scene(
     return points + offset, images, matches
 
 
-def assert_recovered(result: TriangulatedPoints, points: Array) -> None:
-    distance = np.linalg.norm(result.xyz[:, None] - points, axis=2)
+def assert_recovered(xyz: Array, points: Array) -> None:
+    distance = np.linalg.norm(xyz[:, None] - points, axis=2)
     assert sorted(distance.argmin(axis=1).tolist()) == list(range(len(points)))
     assert distance.min(axis=1).max() < 1e-3
 
 
 @pytest.fixture(scope="module")
-def triangulated() -> TriangulatedPoints:
+def triangulated() -> Triangulated:
     """The points of the scene of all cameras."""
     _, images, matches = scene(*MIXED)
     return triangulate(images, matches)
 
 
-def test_points_are_recovered_by_cameras_of_all_models(triangulated: TriangulatedPoints) -> None:
+def test_points_are_recovered_by_cameras_of_all_models(triangulated: Triangulated) -> None:
     points, _, _ = scene(*MIXED)
-    assert_recovered(triangulated, points)
-    assert len(triangulated.point_ids) == 5 * 40  # every point is seen in every image
-    assert triangulated.errors_px.shape == (40,) and triangulated.errors_px.max() < 1e-3
+    xyz, errors_px, seen = triangulated
+    assert_recovered(xyz, points)
+    assert len(seen) == 5 * 40  # every point is seen in every image
+    assert errors_px.shape == (40,) and errors_px.max() < 1e-3
 
 
-def test_earth_centred_coordinates_lose_nothing(triangulated: TriangulatedPoints) -> None:
-    offset, near = np.array([4.2e6, 1.7e5, 4.78e6]), triangulated
+def test_earth_centred_coordinates_lose_nothing(triangulated: Triangulated) -> None:
+    offset, (near_xyz, _, near) = np.array([4.2e6, 1.7e5, 4.78e6]), triangulated
     points, images, matches = scene(*MIXED, offset=offset)
-    result = triangulate(images, matches)
-    assert_recovered(result, points)
-    np.testing.assert_allclose(result.xyz - offset, near.xyz, atol=1e-5)
-    np.testing.assert_array_equal(result.keypoint_ids, near.keypoint_ids)
+    xyz, _, seen = triangulate(images, matches)
+    assert_recovered(xyz, points)
+    np.testing.assert_allclose(xyz - offset, near_xyz, atol=1e-5)
+    np.testing.assert_array_equal(seen[:, 2], near[:, 2])
 
 
 def test_observations_are_the_matched_keypoints_sorted_by_point_and_image(
-    triangulated: TriangulatedPoints,
+    triangulated: Triangulated,
 ) -> None:
     points, images, _ = scene(*MIXED)
-    result = triangulated
-    nearest = np.linalg.norm(result.xyz[:, None] - points, axis=2).argmin(axis=1)
-    for point, image, keypoint in zip(
-        result.point_ids, result.image_ids, result.keypoint_ids, strict=True
-    ):
+    xyz, _, seen = triangulated
+    nearest = np.linalg.norm(xyz[:, None] - points, axis=2).argmin(axis=1)
+    for point, image, keypoint in seen:
         entry = images[image]
         in_cam = entry.cam_from_world.apply(points[nearest[point]][None])
         pixel = px_from_cam(entry.camera, in_cam)[0]
         np.testing.assert_allclose(entry.keypoints_px[keypoint], pixel, atol=1e-3)
-    rows = np.stack([result.point_ids, result.image_ids, result.keypoint_ids], axis=1)
-    np.testing.assert_array_equal(rows, rows[np.lexsort(rows.T[::-1])])  # sorted
+    np.testing.assert_array_equal(seen, seen[np.lexsort(seen.T[::-1])])  # sorted
     # points are in the order of their observations, not in COLMAP's
-    tracks = [rows[rows[:, 0] == k, 1:].tolist() for k in range(len(result.xyz))]
+    tracks = [seen[seen[:, 0] == k, 1:].tolist() for k in range(len(xyz))]
     assert tracks == sorted(tracks)
 
 
 def test_without_images_or_matches_there_are_no_points() -> None:
     _, images, _ = scene(PINHOLE)
-    for nothing in (triangulate([], {}), triangulate(images, {})):
-        assert nothing.xyz.shape == (0, 3) and nothing.errors_px.shape == (0,)
-        assert len(nothing.point_ids) == len(nothing.image_ids) == len(nothing.keypoint_ids) == 0
+    for xyz, errors_px, seen in (triangulate([], {}), triangulate(images, {})):
+        assert xyz.shape == (0, 3) and errors_px.shape == (0,)
+        assert seen.shape == (0, 3)
 
 
 def test_tracks_of_two_images_are_optional() -> None:
     points, images, matches = scene(PINHOLE)
     two = {(1, 3): matches[1, 3]}
-    assert len(triangulate(images, two).xyz) == 0
-    kept = triangulate(images, two, TriangulationOptions(two_view_tracks=True))
-    assert_recovered(kept, points)
-    assert set(kept.image_ids.tolist()) == {1, 3}
+    assert len(triangulate(images, two)[0]) == 0
+    xyz, _, seen = triangulate(images, two, TriangulationOptions(two_view_tracks=True))
+    assert_recovered(xyz, points)
+    assert set(seen[:, 1].tolist()) == {1, 3}
 
 
 def test_observations_with_a_large_reprojection_error_are_dropped() -> None:
@@ -127,8 +125,8 @@ def test_observations_with_a_large_reprojection_error_are_dropped() -> None:
     wrong = np.arange(len(keypoints)) % 2 == 0
     keypoints[wrong] += (0.0, 12.0)  # across the epipolar lines
     images[0] = replace(images[0], keypoints_px=keypoints)
-    result = triangulate(images, matches)
-    rows = result.keypoint_ids[result.image_ids == 0]
+    _, _, seen = triangulate(images, matches)
+    rows = seen[seen[:, 1] == 0, 2]
     assert not wrong[rows].any() and len(rows) == 20
 
 
@@ -143,7 +141,7 @@ def test_nearly_parallel_rays_give_no_point() -> None:
         pixels = px_from_cam(image.camera, image.cam_from_world.apply(points))
         close[k] = replace(image, keypoints_px=pixels.astype(np.float32))
     same = np.stack([np.arange(40)] * 2, axis=1)
-    assert len(triangulate(close, {(0, 1): same, (0, 2): same, (1, 2): same}).xyz) == 0
+    assert len(triangulate(close, {(0, 1): same, (0, 2): same, (1, 2): same})[0]) == 0
 
 
 def test_keypoints_may_have_more_columns_and_an_image_no_keypoints() -> None:
@@ -153,9 +151,9 @@ def test_keypoints_may_have_more_columns_and_an_image_no_keypoints() -> None:
         for image in images
     ]
     wide.append(replace(images[0], name="empty.jpg", keypoints_px=np.zeros((0, 2), np.float32)))
-    result = triangulate(wide, {**matches, (0, 4): np.zeros((0, 2), np.int64)})
-    assert_recovered(result, points)
-    assert 4 not in result.image_ids
+    xyz, _, seen = triangulate(wide, {**matches, (0, 4): np.zeros((0, 2), np.int64)})
+    assert_recovered(xyz, points)
+    assert 4 not in seen[:, 1]
 
 
 def test_colmap_prints_nothing_and_leaves_no_files(
@@ -164,7 +162,7 @@ def test_colmap_prints_nothing_and_leaves_no_files(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.delenv("MEGLOC_COLMAP_LOG", raising=False)
     _, images, matches = scene(PINHOLE)
-    assert len(triangulate(images, matches).xyz) == 40
+    assert len(triangulate(images, matches)[0]) == 40
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
 

@@ -288,7 +288,7 @@ def write_wall(root: Path, *, unposed: Sequence[int] = ()) -> KaptureFolder:
             writer.write(image_name, pixels)
         points, images = np.array(rows).T
         ids = images.astype(np.int32), points.astype(np.int32)
-        seen[name] = Observations(name, NAMES, points, *ids)
+        seen[name] = Observations(NAMES, points, *ids)
     write_points3d(root, np.column_stack([xyz, rng.integers(0, 256, (66, 3))]))
     write_observations(root, seen)
     return KaptureFolder(root)

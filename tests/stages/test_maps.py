@@ -201,7 +201,7 @@ def published(source: KaptureFolder, root: Path) -> KaptureFolder:
         for number, keypoint in enumerate(used.tolist()):
             numbers[here[seen.keypoint_ids[here] == keypoint]] = number
         writer.write(image, source.keypoints(TYPE).read(image)[used, :2])
-    again = Observations(TYPE, seen.image_names, seen.point_ids, seen.image_ids, numbers)
+    again = Observations(seen.image_names, seen.point_ids, seen.image_ids, numbers)
     write_observations(root, {TYPE: again})
     return KaptureFolder(root)
 

@@ -121,7 +121,6 @@ def test_map_pairs_by_covisibility_count_points_of_all_types(
     halves = {
         name: replace(
             whole,
-            keypoints_type=name,
             point_ids=whole.point_ids[rows],
             image_ids=whole.image_ids[rows],
             keypoint_ids=whole.keypoint_ids[rows],

@@ -121,8 +121,8 @@ class KaptureFolder:
             path = self._observations_path
             by_type = read_observations(path)
             num_points = len(self.points3d())
-            for observations in by_type.values():
-                self._check_observations(observations, num_points, path)
+            for keypoints_type, observations in by_type.items():
+                self._check_observations(keypoints_type, observations, num_points, path)
                 for array in (
                     observations.point_ids,
                     observations.image_ids,
@@ -208,9 +208,10 @@ class KaptureFolder:
                     f"point past the keypoints of {image!r}",
                 )
 
-    def _check_observations(self, observations: Observations, num_points: int, path: Path) -> None:
+    def _check_observations(
+        self, keypoints_type: str, observations: Observations, num_points: int, path: Path
+    ) -> None:
         limit = np.full(len(observations.image_names), np.iinfo(np.int32).max, dtype=np.int64)
-        keypoints_type = observations.keypoints_type
         if keypoints_type in self.types("keypoints"):
             keypoints = self.keypoints(keypoints_type)
             for index, image in enumerate(observations.image_names):

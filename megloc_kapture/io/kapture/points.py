@@ -74,13 +74,12 @@ def write_points3d(root: Path, points: ArrayLike) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Observations of 3D points, sorted by point; those of one point are in file order.
+    """Observations of 3D points by keypoints of one type.
 
-    ``image_ids`` index the sorted ``image_names``; ``keypoint_ids`` are rows of the keypoints of
-    these images.
+    They are sorted by point; those of one point are in file order. ``image_ids`` index the sorted
+    ``image_names``; ``keypoint_ids`` are rows of the keypoints of these images.
     """
 
-    keypoints_type: str
     image_names: tuple[str, ...]
     point_ids: NDArray[np.int64]
     image_ids: NDArray[np.int32]
@@ -94,7 +93,6 @@ class Observations:
             return self
         order = np.argsort(self.point_ids, kind="stable")
         return Observations(
-            self.keypoints_type,
             self.image_names,
             self.point_ids[order],
             self.image_ids[order],
@@ -103,6 +101,7 @@ class Observations:
 
 
 def read_observations(path: Path) -> dict[str, Observations]:
+    """Read ``observations.txt`` by keypoints type."""
     images, types = _numbers(), _numbers()
     blocks: list[tuple[NDArray[np.integer], ...]] = []
     with reading(path), named(path), open(path, encoding="utf-8-sig") as file:
@@ -131,7 +130,6 @@ def read_observations(path: Path) -> dict[str, Observations]:
         rank = np.empty(len(names), np.int32)
         rank[used] = np.arange(len(used))
         by_type[keypoints_type] = Observations(
-            keypoints_type,
             tuple(names[used].tolist()),
             points[rows],
             rank[image_ids[rows]],

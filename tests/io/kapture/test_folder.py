@@ -51,7 +51,7 @@ def root(tmp_path: Path) -> Path:
 def write_points(root: Path, *extra: tuple[int, int, int]) -> None:
     """Observations: two good ones and the given (point, image, keypoint)."""
     points, images, keypoints = np.array([(0, 0, 0), (2, 1, 4), *extra]).T
-    write_observations(root, {"T": Observations("T", IMAGES, points, images, keypoints)})
+    write_observations(root, {"T": Observations(IMAGES, points, images, keypoints)})
 
 
 def test_a_complete_kapture_is_valid_and_its_parts_are_listed(root: Path) -> None:

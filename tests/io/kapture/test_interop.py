@@ -108,7 +108,7 @@ CONFIGS = {
 }
 POINTS = np.random.default_rng(1).normal(0, 100, (4, 6))
 IDS = np.array([[0, 0, 3], [2, 0, 1], [4, 0, 2]], dtype=np.int32)  # points, images, keypoints
-OBSERVATIONS = Observations("T", IMAGES, IDS[0].astype(np.int64), *IDS[1:])
+OBSERVATIONS = Observations(IMAGES, IDS[0].astype(np.int64), *IDS[1:])
 
 
 def write_ours(root: Path) -> None:
