@@ -27,8 +27,9 @@ from megloc_kapture.evaluation.evaluate import (
 )
 from megloc_kapture.evaluation.report.queries import (
     NO_POSE_COLOR,
-    StoredInliers,
     frame_of_query,
+    inlier_sources,
+    inliers_of,
     legend,
     query_facts,
     shown_queries,
@@ -90,7 +91,7 @@ def write_view(
         title = evaluation.label or title
     elif truth is not None:
         raise OptionError("true poses need a result to compare with")
-    view = view_data(StoredInliers(context), queries)
+    view = view_data(context, queries)
     if view is None:
         raise DataError("no image has a pose, so there is nothing to show", path=folder.root)
     data, notes = view
@@ -121,7 +122,7 @@ def _check_output(path: Path, *, force: bool) -> None:
 
 
 def view_data(
-    stored: StoredInliers, queries: Sequence[QueryResult] = ()
+    context: ResultContext, queries: Sequence[QueryResult] = ()
 ) -> tuple[dict[str, Any], list[str]] | None:
     """Return the data of the page's script, and sentences about what they omit.
 
@@ -132,7 +133,7 @@ def view_data(
     query. Frames of points, cameras and queries are indices into ``frames``, of which one is shown
     at a time. ``radius`` is that of the content in view at first.
     """
-    context, notes = stored.context, list[str]()
+    notes = list[str]()
     rng = np.random.default_rng(_SEED)
     mapping = context.mapping
     map_poses = context.map_poses()
@@ -170,10 +171,11 @@ def view_data(
     rays = _rays(context.queries, [query.image for query in queries], context.cameras)
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
     most = min(_MAX_INLIERS // with_inliers, _MAX_INLIERS_OF_ONE)
-    if stored.known and len(queries) > _MAX_QUERIES_WITH_INLIERS:
+    sources = inlier_sources(context)
+    if (sources or context.localized) and len(queries) > _MAX_QUERIES_WITH_INLIERS:
         notes.append(f"Inliers are drawn for the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
     inliers = [
-        stored.of(query)[1] if query.num_inliers else np.zeros((0, 3))
+        inliers_of(query, context, sources) if query.num_inliers else np.zeros((0, 3))
         for query in queries[:_MAX_QUERIES_WITH_INLIERS]
     ]
     inliers += [np.zeros((0, 3))] * (len(queries) - len(inliers))

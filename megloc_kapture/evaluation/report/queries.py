@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,6 @@ from megloc_kapture.matching.guided_pyramid import base_type
 NUM_SHOWN = 10
 # inlier threshold, as in pose estimation
 INLIER_PX = 12.0
-_NOTHING = np.zeros((0, 2)), np.zeros((0, 3))
 # from small to large errors; distinguishable with a colour vision deficiency
 _SCALE = ("#4cc3f0", "#7fd17f", "#f4d35e", "#ff9f45", "#ff4d4d")
 NO_POSE_COLOR, UNKNOWN_COLOR = "#9aa5b1", "#c9a7ff"
@@ -105,65 +103,59 @@ def worst_queries(queries: Sequence[QueryResult]) -> list[QueryResult]:
     return posed[:num_posed] + lost[: NUM_SHOWN - num_posed]
 
 
-@dataclass(eq=False)
-class StoredInliers:
-    """Inliers of queries, recomputed from the stored matches, keypoints, map points and poses.
+# keypoints and matches of the queries, and map points, of one keypoints type
+InlierSource = tuple[FeatureReader, MatchesReader, MapIndex]
+
+
+def inlier_sources(context: ResultContext) -> list[InlierSource]:
+    """Open the stored data from which inliers can be recomputed; broken data are skipped."""
+    # slow import
+    from megloc_kapture.stages.query_poses import type_in_map
+    from megloc_kapture.stages.scene import index_map
+
+    sources: list[InlierSource] = []
+    queries, mapping = context.queries, context.mapping
+    if queries is None or mapping is None or not mapping.has_points():
+        return sources
+    with contextlib.suppress(DataError):
+        types = set(queries.types("matches"))
+        # skip the base type of a guided pyramid, which includes its matches
+        types -= {base_type(name) for name in types if base_type(name) != name}
+        for name in sorted(types & set(queries.types("keypoints"))):
+            index = index_map(mapping, type_in_map(mapping, name))
+            sources.append((queries.keypoints(name), queries.matches(name), index))
+    return sources
+
+
+def inliers_of(
+    query: QueryResult, context: ResultContext, sources: Sequence[InlierSource]
+) -> NDArray[np.float64]:
+    """Return world points (K, 3) of a pose's inliers, recomputed if they are not in memory.
 
     Missing or broken data are skipped: a picture without inliers is better than none.
     """
-
-    context: ResultContext
-
-    @cached_property
-    def _sources(self) -> list[tuple[FeatureReader, MatchesReader, MapIndex]]:
-        # slow import
-        from megloc_kapture.stages.query_poses import type_in_map
-        from megloc_kapture.stages.scene import index_map
-
-        sources: list[tuple[FeatureReader, MatchesReader, MapIndex]] = []
-        queries, mapping = self.context.queries, self.context.mapping
-        if queries is None or mapping is None or not mapping.has_points():
-            return sources
-        with contextlib.suppress(DataError):
-            types = set(queries.types("matches"))
-            # skip the base type of a guided pyramid, which includes its matches
-            types -= {base_type(name) for name in types if base_type(name) != name}
-            for name in sorted(types & set(queries.types("keypoints"))):
-                index = index_map(mapping, type_in_map(mapping, name))
-                sources.append((queries.keypoints(name), queries.matches(name), index))
-        return sources
-
-    @property
-    def known(self) -> bool:
-        return bool(self._sources or self.context.localized)
-
-    def of(self, query: QueryResult) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return pixels (K, 2) and world points (K, 3) of the inliers of a query's pose."""
-        pose, queries = self.context.localized.get(query.image), self.context.queries
-        if pose is not None and pose.inlier_points_world is not None:
-            px, xyz = pose.inlier_points_px, pose.inlier_points_world
-            return (np.zeros((len(xyz), 2)) if px is None else px), xyz
-        if query.cam_from_world is None or query.outcome != "localized" or queries is None:
-            return _NOTHING
-        inliers = [_NOTHING]
-        with contextlib.suppress(DataError):
-            for keypoints, matches, index in self._sources:
-                camera = queries.read().camera_of(query.image)
-                pairs = [(query.image, image) for image in query.candidates]
-                read = [(pair[1], *matches.read(*pair)) for pair in pairs if pair in matches]
-                if not read or query.image not in keypoints:
-                    continue
-                stored = keypoints.read(query.image)
-                ids = TypedMatches(index, stored, read).correspondences()
-                pixels = np.asarray(stored[:, :2], np.float64)
-                if len(pixels) <= ids.keypoint_ids.max(initial=-1):
-                    continue
-                px, xyz = pixels[ids.keypoint_ids], index.xyz[ids.point_ids]
-                errors_px = np.linalg.norm(project(camera, query.cam_from_world, xyz) - px, axis=1)
-                inliers.append((px[errors_px <= INLIER_PX], xyz[errors_px <= INLIER_PX]))
-        return np.concatenate([px for px, _ in inliers]), np.concatenate(
-            [xyz for _, xyz in inliers]
-        )
+    pose, queries = context.localized.get(query.image), context.queries
+    if pose is not None and pose.inlier_points_world is not None:
+        return pose.inlier_points_world
+    inliers = [np.zeros((0, 3))]
+    if query.cam_from_world is None or query.outcome != "localized" or queries is None:
+        return inliers[0]
+    with contextlib.suppress(DataError):
+        for keypoints, matches, index in sources:
+            camera = queries.read().camera_of(query.image)
+            pairs = [(query.image, image) for image in query.candidates]
+            read = [(pair[1], *matches.read(*pair)) for pair in pairs if pair in matches]
+            if not read or query.image not in keypoints:
+                continue
+            stored = keypoints.read(query.image)
+            ids = TypedMatches(index, stored, read).correspondences()
+            pixels = np.asarray(stored[:, :2], np.float64)
+            if len(pixels) <= ids.keypoint_ids.max(initial=-1):
+                continue
+            px, xyz = pixels[ids.keypoint_ids], index.xyz[ids.point_ids]
+            errors_px = np.linalg.norm(project(camera, query.cam_from_world, xyz) - px, axis=1)
+            inliers.append(xyz[errors_px <= INLIER_PX])
+    return np.concatenate(inliers)
 
 
 def spread(number: int, most: int) -> NDArray[np.int64]:

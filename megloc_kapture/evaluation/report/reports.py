@@ -28,7 +28,7 @@ from megloc_kapture.evaluation.comparison import (
 )
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.report import content
-from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries, worst_queries
+from megloc_kapture.evaluation.report.queries import shown_queries, worst_queries
 from megloc_kapture.evaluation.results import Poses, first_map_poses
 from megloc_kapture.evaluation.scoring import Evaluation, Reported
 from megloc_kapture.io.files import write_bytes, write_json
@@ -362,7 +362,7 @@ def _view(reported: Reported) -> str | None:
     # a report without a view is better than none; `megloc view` reports the error
     with contextlib.suppress(DataError):
         queries = shown_queries(evaluation)
-        if (view := view_data(StoredInliers(evaluation.context), queries)) is not None:
+        if (view := view_data(evaluation.context, queries)) is not None:
             data, notes = view
             return render_view(evaluation.label or "Evaluation", data, queries, notes)
     return None

@@ -17,7 +17,7 @@ import pytest
 from scored import evaluate_poses, upright_camera, write_kapture
 
 from megloc_kapture.evaluation import view as scenes
-from megloc_kapture.evaluation.report.queries import StoredInliers, legend, shown_queries
+from megloc_kapture.evaluation.report.queries import legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.view import render_view, view_data
@@ -88,7 +88,7 @@ View = tuple[dict[str, Any], list[str]]
 
 def drawn(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> View:
     mapping = KaptureFolder(root)
-    view = view_data(StoredInliers(ResultContext(mapping=mapping, **context)), queries)
+    view = view_data(ResultContext(mapping=mapping, **context), queries)
     assert view is not None
     return view
 
@@ -213,7 +213,7 @@ def test_coordinate_frames_are_separate(world: Any, make_map: Any) -> None:
     assert data["queryFrames"].tolist() == [k % 2 for k in range(len(shown))]
     assert "DUC2</option>" in page_of(root, shown, side_tables=root / "tables")
     assert 'id="frame"' not in page_of(root, shown)
-    assert view_data(StoredInliers(ResultContext())) is None
+    assert view_data(ResultContext()) is None
 
 
 def test_points_without_colours_get_image_colours(make_map: Any) -> None:
