@@ -35,22 +35,19 @@ _RELOCALIZATION_NAMES = (
 Row = TypeVar("Row")
 
 
-@dataclass(frozen=True, slots=True)
-class StereoCalibration:
-    """The PINHOLE cameras of the undistorted images, cam0 left and cam1 right.
+# the two cameras by name, each with its cam_from_cam0 in metres
+Calibration = Mapping[str, tuple[Camera, RigidTransform]]
 
-    ``cam1_from_cam0`` is in metres. The dataset's page says "from the right to the left camera",
-    but camchain.yaml, the sign and all users of the data agree on cam1 from cam0.
+
+def read_calibration(folder: Path) -> Calibration:
+    """Read the cameras of the undistorted images: cam0, the left one, and cam1.
+
+    The dataset's page says that the stereo file has the transform "from the right to the left
+    camera", but camchain.yaml, the sign and all users of the data agree on cam1 from cam0.
     """
-
-    cam0: Camera
-    cam1: Camera
-    cam1_from_cam0: RigidTransform
-
-
-def read_calibration(folder: Path) -> StereoCalibration:
     cam0, cam1 = (read_pinhole(folder / name) for name in CAMERA_FILES)
-    return StereoCalibration(cam0, cam1, read_transform(folder / STEREO_FILE, comments=True))
+    cam1_from_cam0 = read_transform(folder / STEREO_FILE, comments=True)
+    return {"cam0": (cam0, RigidTransform.identity()), "cam1": (cam1, cam1_from_cam0)}
 
 
 def read_pinhole(path: Path) -> Camera:
@@ -166,8 +163,11 @@ PUBLISHED_PAIRS = {
 
 @dataclass(frozen=True)
 class Recording:
-    name: str
     folder: Path
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
 
     @property
     def has_poses(self) -> bool:
@@ -185,7 +185,7 @@ class Recording:
         images = (self.folder / _IMAGES / camera).glob("*.png")
         return sorted(int(path.stem) for path in images if _TIMESTAMP.fullmatch(path.stem))
 
-    def calibration(self, root: Path) -> StereoCalibration:
+    def calibration(self, root: Path) -> Calibration:
         for folder in (self.folder, root):
             for name in CALIBRATION_FOLDERS:
                 if (folder / name).is_dir():
@@ -212,7 +212,7 @@ class RelocalizationFile:
 
 def find_recordings(root: Path) -> dict[str, Recording]:
     recordings = {
-        folder.name: Recording(folder.name, folder)
+        folder.name: Recording(folder)
         for folder in _folders(root)
         if any((folder / mark).exists() for mark in _MARKS)
     }

@@ -24,10 +24,10 @@ from megloc_kapture.datasets.fourseasons import (
     POSES,
     PUBLISHED_PAIRS,
     TRANSFORMATIONS,
+    Calibration,
     Recording,
     RelocalizationFile,
     Selection,
-    StereoCalibration,
     read_gnss_poses,
     read_poses,
     read_transformations,
@@ -190,23 +190,20 @@ class FourSeasons:
         self,
         data: KaptureData,
         recording: Recording,
-        calibration: StereoCalibration,
+        calibration: Calibration,
         car: str,
         times: Iterable[int],
         missing: Missing,
     ) -> None:
         """Add a recording's rig, and its images at these times (ns)."""
-        cameras = (calibration.cam0, calibration.cam1)[: 2 if self.options.stereo else 1]
-        cams_from_car = (RigidTransform.identity(), calibration.cam1_from_cam0)
-        sensors = [name + car.removeprefix(RIG) for name in CAMERAS]
+        names = CAMERAS if self.options.stereo else CAMERAS[:1]
+        sensor_of = {name: name + car.removeprefix(RIG) for name in names}
         members = data.rigs.setdefault(car, {})
-        for name, sensor, camera, cam_from_car in zip(
-            CAMERAS, sensors, cameras, cams_from_car, strict=False
-        ):
+        for name, sensor in sensor_of.items():
+            camera, members[sensor] = calibration[name]  # the car's frame is that of cam0
             data.sensors[sensor] = Sensor.from_camera(camera, name=name)
-            members[sensor] = cam_from_car
         for timestamp in times:
-            for name, sensor, _ in zip(CAMERAS, sensors, cameras, strict=False):
+            for name, sensor in sensor_of.items():
                 if missing.require(recording.image_file(timestamp, name)):
                     image = recording.image(timestamp, name)
                     data.records_camera[timestamp, sensor] = image
@@ -227,13 +224,13 @@ class FourSeasons:
         return sorted(times)
 
 
-def _car_ids(calibrations: Mapping[str, StereoCalibration]) -> dict[str, str]:
+def _car_ids(calibrations: Mapping[str, Calibration]) -> dict[str, str]:
     """Return the rig of each recording; recordings with the same calibration share one."""
-    of_calibration: dict[StereoCalibration, str] = {}
+    cars: dict[str, str] = {}
     for recording, calibration in calibrations.items():
-        car = f"{RIG}_{recording}" if of_calibration else RIG
-        of_calibration.setdefault(calibration, car)
-    return {recording: of_calibration[c] for recording, c in calibrations.items()}
+        same = next((car for other, car in cars.items() if calibrations[other] == calibration), "")
+        cars[recording] = same or (f"{RIG}_{recording}" if cars else RIG)
+    return cars
 
 
 def _known_poses(
