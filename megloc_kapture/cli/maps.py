@@ -23,11 +23,10 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
-from megloc_kapture.io.dataset_tables import keep_unit
+from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
 from megloc_kapture.io.files import reading
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
-from megloc_kapture.pipeline.kapture_map import restrictions_beside
 from megloc_kapture.pipeline.map_making import (
     describe_map,
     options_of_photographs,
@@ -96,9 +95,7 @@ class RefineMap(Reading, Choosing, Working):
         options = self.options().refinement
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
-            refine_map(
-                source, out, options, restrictions=restrictions_beside(source.root), work=work
-            )
+            refine_map(source, out, options, tables=read_tables_of(source.root), work=work)
             keep_unit(source.root, out)
         for row in report_lines(self.output):
             self.say(row)
@@ -151,7 +148,7 @@ class Densify(Reading, Choosing, Working):
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             counts = densify_map(
-                source, out, options, restrictions=restrictions_beside(source.root), work=work
+                source, out, options, tables=read_tables_of(source.root), work=work
             )
             keep_unit(source.root, out)
             self.say(counts_text(counts))
@@ -195,7 +192,7 @@ class RefinePoses(Choosing, Working):
                 KaptureFolder(self.poses),
                 out,
                 options,
-                restrictions=restrictions_beside(self.query),
+                tables=read_tables_of(self.query),
                 work=work,
             )
         print(f"{counts_text(counts)}; status.csv and refinement.csv in {self.output}")

@@ -31,10 +31,9 @@ from megloc_kapture.cli.common import (
     kapture_map,
 )
 from megloc_kapture.errors import OptionError, check_option, require
-from megloc_kapture.io.dataset_tables import keep_unit
+from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.matching.verification import KnownPoseOptions
-from megloc_kapture.pipeline.kapture_map import restrictions_beside
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.plugin_loading import load_chosen, load_plugin, option_fault, plugin_class
@@ -264,7 +263,7 @@ class PairsMapping(Reading, Choosing, Working):
                 mapping,
                 options,
                 retrieval=retrieval,
-                restrictions=restrictions_beside(mapping.root),
+                tables=read_tables_of(mapping.root),
                 covisible=None if covisible is None else self.kapture_map(covisible),
             )
         write_pairs(self.output, pairs)
@@ -320,7 +319,7 @@ class PairsQuery(Reading, Choosing, Working):
                 query,
                 options.query_pairs,
                 retrieval=retrieval,
-                restrictions=restrictions_beside(self.query),
+                tables=read_tables_of(self.query),
             )
         if self.rerank is not None and self.matches_dir is not None:
             local_types = self._types_of_both(mapping, query)

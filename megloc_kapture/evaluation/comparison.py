@@ -25,7 +25,7 @@ from megloc_kapture.evaluation.metrics import (
 )
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_result, recall_rows
-from megloc_kapture.io.dataset_tables import SideTables
+from megloc_kapture.io.dataset_tables import NO_TABLES, SideTables
 
 SIGNIFICANCE = 0.05
 NUM_RESAMPLES, _CHUNK = 2000, 250
@@ -234,7 +234,7 @@ class WithoutTruth(Reported):
 
 def evaluate_without_truth(
     results: Sequence[Result],
-    benchmark: SideTables = SideTables(),  # noqa: B008
+    benchmark: SideTables = NO_TABLES,
     *,
     queries: Collection[str] | None = None,
     thresholds: Sequence[Threshold] | None = None,

@@ -30,7 +30,7 @@ from megloc_kapture.evaluation.metrics import (
 )
 from megloc_kapture.evaluation.results import Poses, Result, ResultContext
 from megloc_kapture.geometry.poses import compose, invert, stack_poses
-from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair, SideTables
+from megloc_kapture.io.dataset_tables import NO_TABLES, ImageGroup, RelocalizationPair, SideTables
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.refinement.acceptance import squared_distance
 from megloc_kapture.values import LocalizationResult, RigidTransform
@@ -224,7 +224,7 @@ def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
 def evaluate_poses(
     result: Result,
     truth: Poses,
-    benchmark: SideTables = SideTables(),  # noqa: B008
+    benchmark: SideTables = NO_TABLES,
     *,
     thresholds: Sequence[Threshold] | None = None,
     nowhere: Collection[str] = (),

@@ -18,12 +18,13 @@ metres. Without protocol.json, the defaults of :class:`Protocol` hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, field_validator
 
 from megloc_kapture.errors import DataError
@@ -194,9 +195,10 @@ class SideTables:
 
     An empty table has no file.
 
-    ``world`` transforms between the local frame (of the map and the true poses) and the official
-    frame (of pose files). ``names`` is the challenge's list, image -> name in a pose file;
-    ``relocalization`` has the image pairs of an MLAD challenge.
+    ``priors`` maps a query to the permitted map images, locations or frames; a query without an
+    entry is unrestricted. ``world`` transforms between the local frame (of the map and the true
+    poses) and the official frame (of pose files). ``names`` is the challenge's list, image -> name
+    in a pose file; ``relocalization`` has the image pairs of an MLAD challenge.
     """
 
     protocol: Protocol = Protocol()
@@ -220,6 +222,48 @@ class SideTables:
         known = set(self.protocol.conditions)
         folders = {i: [f for f in PurePosixPath(i).parts[:-1] if f in known] for i in images}
         return {image: names[0] for image, names in folders.items() if len(names) == 1}
+
+    def frame(self, image: str) -> str:
+        """Return the coordinate frame of a map image; ``""`` if there is only one."""
+        group = self.groups.get(image)
+        return "" if group is None else group.frame
+
+    def frames(self, images: Sequence[str]) -> list[NDArray[np.int64]]:
+        """Return the indices into ``images`` of each frame; frames are sorted by name."""
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            members.setdefault(self.frame(image), []).append(position)
+        return [np.array(members[name], np.int64) for name in sorted(members)]
+
+    def pools(
+        self, queries: Sequence[str], images: Sequence[str]
+    ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
+        """Group queries by their permitted map images.
+
+        Yield indices into ``queries`` and sorted indices into ``images``, int64 (M,); M may be 0.
+        """
+        together: dict[tuple[str, ...] | None, list[int]] = {}
+        for position, query in enumerate(queries):
+            prior = self.priors.get(query)
+            together.setdefault(None if prior is None else tuple(prior), []).append(position)
+        members = self._members(images) if set(together) != {None} else {}
+        for permitted, positions in together.items():
+            if permitted is None:
+                yield positions, np.arange(len(images))
+                continue
+            allowed = [position for name in permitted for position in members.get(name, ())]
+            yield positions, np.unique(np.array(allowed, dtype=np.int64))
+
+    def _members(self, images: Sequence[str]) -> dict[str, list[int]]:
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            group = self.groups.get(image, ImageGroup())
+            for name in {image, group.location, group.frame} - {""}:
+                members.setdefault(name, []).append(position)
+        return members
+
+
+NO_TABLES = SideTables()
 
 
 def read_side_tables(folder: Path) -> SideTables:
@@ -299,6 +343,12 @@ def tables_of(root: Path | str) -> Path | None:
         if (folder / SIDE_TABLES / PROTOCOL_FILE).is_file():
             return folder / SIDE_TABLES
     return None
+
+
+def read_tables_of(root: Path | str) -> SideTables:
+    """Read the tables in a kapture folder or its parent; no table has rows if both lack them."""
+    tables = tables_of(root)
+    return NO_TABLES if tables is None else read_side_tables(tables)
 
 
 def write_unit(root: Path, unit: str) -> None:

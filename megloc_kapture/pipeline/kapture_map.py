@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.geometry.cameras import shift_principal_point
-from megloc_kapture.io.dataset_tables import tables_of, unit_of
+from megloc_kapture.io.dataset_tables import NO_TABLES, SideTables, read_tables_of, unit_of
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.weights import registry
 from megloc_kapture.localization.map_index import MapIndex
@@ -22,7 +22,6 @@ from megloc_kapture.mapping.map_check import Origin, PixelOrigin, find_pixel_ori
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
-from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.scene import check_points, index_map, observed_keypoints, with_noise
@@ -96,13 +95,13 @@ class KaptureMap:
     """Read-only map with 3D points, observations and keypoints; see :meth:`open`.
 
     All coordinates are in COLMAP's convention. ``keypoints`` are the types used for localization.
-    ``restrictions`` are the coordinate frames of map images and the priors of queries, if the map
-    is in a workspace.
+    ``tables`` have the coordinate frames of map images and the priors of queries, if the map is in
+    a workspace.
     """
 
     folder: KaptureFolder
     keypoints: Mapping[str, MapKeypoints]
-    restrictions: Restrictions = UNRESTRICTED
+    tables: SideTables = NO_TABLES
 
     @classmethod
     def open(
@@ -145,7 +144,7 @@ class KaptureMap:
                 for name, origin in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
-        return cls(folder, keypoints, restrictions_beside(folder.root))
+        return cls(folder, keypoints, read_tables_of(folder.root))
 
     @property
     def pixel_origin(self) -> PixelOrigin:
@@ -234,12 +233,6 @@ class KaptureMap:
             for name, reader in readers.items()
             if all(image in reader for image in self.images)
         ]
-
-
-def restrictions_beside(root: Path) -> Restrictions:
-    """Return the restrictions in the side tables of a kapture folder's workspace, if any."""
-    tables = tables_of(root)
-    return UNRESTRICTED if tables is None else Restrictions.read(tables)
 
 
 def plain_name(local_type: str) -> str:

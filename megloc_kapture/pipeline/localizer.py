@@ -63,7 +63,7 @@ class Localizer:
         self._ranker = self.options.localization.make_ranker(self.options.placement)
         self.refiners = MapRefiners(
             kapture_map.folder,
-            kapture_map.restrictions,
+            kapture_map.tables,
             self.options.pose_refinement,
             self.options.placement,
         )
@@ -150,7 +150,7 @@ class Localizer:
             results = localize_query(
                 sources,
                 self.options.localization,
-                frame_of=self.map.restrictions.frame,
+                frame_of=self.map.tables.frame,
                 centers=self._centers,
                 ranker=self._ranker,
                 scene=scene,

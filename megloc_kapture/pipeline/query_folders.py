@@ -257,7 +257,7 @@ class KaptureQueries(Queries):
             name=name,
             features=features,
             global_features=of_image,
-            prior=self._priors[name] if name in self._map.restrictions.priors else None,
+            prior=self._priors[name] if name in self._map.tables.priors else None,
             candidates=candidates,
             mask=mask_path(self._folder, name),
             depth=partial(depth_of, self._folder, name) if self._data.records_depth else None,
@@ -267,7 +267,7 @@ class KaptureQueries(Queries):
     def _priors(self) -> dict[str, tuple[str, ...]]:
         images = self._map.images
         prior_of = {}
-        for positions, permitted in self._map.restrictions.pools(self.names, images):
+        for positions, permitted in self._map.tables.pools(self.names, images):
             prior = tuple(images[position] for position in permitted)
             prior_of.update(dict.fromkeys((self.names[at] for at in positions), prior))
         return prior_of

@@ -228,7 +228,7 @@ class Service:
             if isinstance(error, DataError) and error.path is not None:
                 raise  # a map file is broken
             raise HTTPException(422, str(error)) from error
-        frame = self.localizer.map.restrictions.frame(result.candidates[0]) if result else ""
+        frame = self.localizer.map.tables.frame(result.candidates[0]) if result else ""
         return Answer.of(result, query.camera, frame)
 
     async def _image_in(self, request: Request) -> tuple[bytes, str | None]:

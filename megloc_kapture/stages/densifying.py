@@ -18,7 +18,13 @@ from pydantic import Field
 
 from megloc_kapture.errors import MeglocError, require
 from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup
+from megloc_kapture.io.dataset_tables import (
+    NO_TABLES,
+    SIDE_TABLES,
+    ImageGroup,
+    SideTables,
+    read_side_tables,
+)
 from megloc_kapture.io.files import link_images, link_records, remove, safe_join
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
@@ -42,7 +48,6 @@ from megloc_kapture.plugins import (
     PluginChoice,
     StereoView,
 )
-from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import (
@@ -118,7 +123,7 @@ def densify_map(
     output: Path,
     options: DensifyOptions,
     *,
-    restrictions: Restrictions = UNRESTRICTED,
+    tables: SideTables = NO_TABLES,
     link_features: bool = False,
     work: Work = HERE,
 ) -> dict[str, float]:
@@ -139,7 +144,7 @@ def densify_map(
     data = source.read()
     fit = fitted_to_poses(source, options.max_size_px)
     indices = [index_map(source, local_type) for local_type in source.observations()]
-    rows = _plan(source, indices, fit, restrictions)
+    rows = _plan(source, indices, fit, tables)
     scratch = output / f".{FOLDER}"
     planned = [row for row in rows if not row.reason]
     estimate = partial(_estimate, source, scratch, fit, estimator)
@@ -210,7 +215,7 @@ def _plan(
     source: KaptureFolder,
     indices: Sequence[MapIndex],
     fit: StereoFit,
-    restrictions: Restrictions,
+    tables: SideTables,
 ) -> list[DepthRow]:
     """Return a row per image, with sources and depth range, or the reason why it has no depth."""
     data, xyz = source.read(), source.points3d()[:, :3]
@@ -229,7 +234,7 @@ def _plan(
     centers = np.array([pose.center() for pose in poses.values()]).reshape(-1, 3)
     members: dict[tuple[str, str, str], NDArray[np.bool_]] = {}
     session = attrgetter("frame", "location", "condition")
-    keys = [session(restrictions.groups.get(image, ImageGroup())) for image in images]
+    keys = [session(tables.groups.get(image, ImageGroup())) for image in images]
     for row, key in enumerate(keys):
         members.setdefault(key, np.zeros(len(images), bool))[row] = True
     has_depth = depth_records(data)
@@ -374,7 +379,7 @@ class Densify(PipelineStage):
             work.folder(self.sparse_map()),
             work.out / MAP,
             self.options.mvs,
-            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
+            tables=read_side_tables(work.path(SIDE_TABLES)),
             link_features=True,
             work=work,
         )

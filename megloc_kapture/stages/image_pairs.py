@@ -5,10 +5,9 @@ Pairs of similar images are retrieved with one or several global features.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,7 +15,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, read_groups, read_priors
+from megloc_kapture.io.dataset_tables import (
+    NO_TABLES,
+    SIDE_TABLES,
+    SideTables,
+    read_side_tables,
+)
 from megloc_kapture.io.kapture import FeatureReader, ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.io.kapture.features import KaptureVectors
 from megloc_kapture.mapping.pairs import (
@@ -47,66 +51,6 @@ from megloc_kapture.stages.stage import (
     StageWork,
 )
 from megloc_kapture.values import Options
-
-
-@dataclass(frozen=True, eq=False)
-class Restrictions:
-    """Priors of the queries, and the coordinate frames of the map images.
-
-    ``groups`` maps a map image to its group. ``priors`` maps a query to the permitted map images,
-    locations or frames; a query without an entry is unrestricted.
-    """
-
-    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
-    priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
-
-    @classmethod
-    def read(cls, side_tables: Path) -> Restrictions:
-        """Read from a workspace's ``megloc/`` folder; missing tables restrict nothing."""
-        return cls(read_groups(side_tables), read_priors(side_tables))
-
-    def frame(self, image: str) -> str:
-        """Return the coordinate frame of a map image; ``""`` if there is only one."""
-        group = self.groups.get(image)
-        return "" if group is None else group.frame
-
-    def frames(self, images: Sequence[str]) -> list[NDArray[np.int64]]:
-        """Return the indices into ``images`` of each frame; frames are sorted by name."""
-        members: dict[str, list[int]] = {}
-        for position, image in enumerate(images):
-            members.setdefault(self.frame(image), []).append(position)
-        return [np.array(members[name], np.int64) for name in sorted(members)]
-
-    def pools(
-        self, queries: Sequence[str], images: Sequence[str]
-    ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
-        """Group queries by their permitted map images.
-
-        Yield indices into ``queries`` and sorted indices into ``images``, int64 (M,); M may be 0.
-        """
-        together: dict[tuple[str, ...] | None, list[int]] = {}
-        for position, query in enumerate(queries):
-            prior = self.priors.get(query)
-            together.setdefault(None if prior is None else tuple(prior), []).append(position)
-        members = self._members(images) if set(together) != {None} else {}
-        for permitted, positions in together.items():
-            if permitted is None:
-                yield positions, np.arange(len(images))
-                continue
-            allowed = [position for name in permitted for position in members.get(name, ())]
-            yield positions, np.unique(np.array(allowed, dtype=np.int64))
-
-    def _members(self, images: Sequence[str]) -> dict[str, list[int]]:
-        members: dict[str, list[int]] = {}
-        for position, image in enumerate(images):
-            group = self.groups.get(image, ImageGroup())
-            for name in {image, group.location, group.frame} - {""}:
-                members.setdefault(name, []).append(position)
-        return members
-
-
-UNRESTRICTED = Restrictions()
-
 
 _QUERY_ELEMENTS = 1 << 27  # elements of query vectors in memory at once: 512 MiB of float32
 
@@ -225,7 +169,7 @@ def pair_map_images(
     options: MappingPairsOptions,
     *,
     retrieval: Retrieval | None,
-    restrictions: Restrictions = UNRESTRICTED,
+    tables: SideTables = NO_TABLES,
     covisible: KaptureFolder | None = None,
 ) -> list[ImagePair]:
     """Pair the posed map images of each coordinate frame; return sorted pairs of sorted names.
@@ -243,7 +187,7 @@ def pair_map_images(
     if options.needs_points():
         point_ids, image_ids = _seen_points(covisible or mapping, images)
     pairs_by_source, similarities = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
-    for members in restrictions.frames(images):
+    for members in tables.frames(images):
         names = [images[member] for member in members]
         row_of = np.full(len(images), -1, dtype=np.int64)
         row_of[members] = np.arange(len(members))
@@ -306,14 +250,14 @@ def pair_queries(
     options: QueryPairsOptions,
     *,
     retrieval: Retrieval | None,
-    restrictions: Restrictions = UNRESTRICTED,
+    tables: SideTables = NO_TABLES,
 ) -> list[ImagePair]:
     """Choose candidates of every query among the posed map images that its prior permits."""
     poses = mapping.read().poses()
     images = sorted(poses)
     queries = query.read().image_names()
     of_query: list[list[ImagePair]] = [[] for _ in queries]
-    pools = restrictions.pools(queries, images)
+    pools = tables.pools(queries, images)
     if options.by == "exhaustive":
         for positions, permitted in pools:
             for at in positions:
@@ -357,7 +301,7 @@ class PairMapping(PipelineStage):
             work.folder(self.mapping(), FEATURES),
             self.options.mapping_pairs,
             retrieval=self.options.retrieval(),
-            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
+            tables=read_side_tables(work.path(SIDE_TABLES)),
             covisible=work.folder(REFERENCE) if self.options.pairs_by_points() else None,
         )
         write_pairs(work.out / MAPPING_PAIRS, pairs)
@@ -383,7 +327,7 @@ class PairQueries(PipelineStage):
             work.folder(self.query(), FEATURES),
             self.options.query_pairs,
             retrieval=self.options.retrieval(),
-            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
+            tables=read_side_tables(work.path(SIDE_TABLES)),
         )
         write_pairs(work.out / self.candidates(), pairs)
         return {"pairs": len(pairs)}

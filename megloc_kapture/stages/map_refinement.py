@@ -19,7 +19,12 @@ from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import depth_noise
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
+from megloc_kapture.io.dataset_tables import (
+    NO_TABLES,
+    SIDE_TABLES,
+    SideTables,
+    read_side_tables,
+)
 from megloc_kapture.io.files import link_images, write_json
 from megloc_kapture.io.kapture import (
     KaptureData,
@@ -45,7 +50,6 @@ from megloc_kapture.mapping.uncertainty import (
     too_uncertain,
 )
 from megloc_kapture.plugins import DepthView
-from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import check_points, depth_of, depth_records
 from megloc_kapture.stages.stage import UNREFINED, PipelineStage, StageWork
@@ -166,7 +170,7 @@ def refine_map(
     output: Path,
     options: MapRefinementOptions,
     *,
-    restrictions: Restrictions = UNRESTRICTED,
+    tables: SideTables = NO_TABLES,
     link_features: bool = False,
     work: Work = HERE,
 ) -> dict[str, float]:
@@ -178,7 +182,7 @@ def refine_map(
     """
     check_points(source, "refine")
     selection = MapSelection(source)
-    _verify_depth(selection, options.depth, restrictions, work)
+    _verify_depth(selection, options.depth, tables, work)
     if options.uncertainty.max_robust_sigmas is not None:
         _reject_uncertain(selection, options.uncertainty.max_robust_sigmas)
     kept = selection.kept_points
@@ -209,7 +213,7 @@ def refine_map(
 def _verify_depth(
     selection: MapSelection,
     options: DepthVerificationOptions,
-    restrictions: Restrictions,
+    tables: SideTables,
     work: Work,
 ) -> None:
     """Drop observations and points that depth maps contradict.
@@ -251,7 +255,7 @@ def _verify_depth(
         dropped[rows[contradicted]] = True
         num_checked += checked
     if lifted.any():
-        scans, neighbours = _scans(selection, sorted(with_depth), restrictions)
+        scans, neighbours = _scans(selection, sorted(with_depth), tables)
         rows = np.flatnonzero(lifted)
         votes, judged = _votes_of_other_scans(selection, rows, scans, neighbours, options, work)
         dropped[rows[votes < 0]] = True
@@ -260,12 +264,12 @@ def _verify_depth(
 
 
 def _scans(
-    selection: MapSelection, images: Sequence[int], restrictions: Restrictions
+    selection: MapSelection, images: Sequence[int], tables: SideTables
 ) -> tuple[list[list[int]], list[set[int]]]:
     """Return the images with depth of each scan, and the nearest scans of each."""
     scans: list[list[int]] = []
     neighbours: list[set[int]] = []
-    for members in restrictions.frames([selection.images[row] for row in images]):
+    for members in tables.frames([selection.images[row] for row in images]):
         rows = [images[member] for member in members]
         centres = np.array([selection.cams_from_world[row].center() for row in rows])
         pairs = cKDTree(centres).query_pairs(_SAME_CENTRE_M, output_type="ndarray")
@@ -393,7 +397,7 @@ class RefineMap(PipelineStage):
             folder,
             out,
             self.options.refinement,
-            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
+            tables=read_side_tables(work.path(SIDE_TABLES)),
             link_features=True,
             work=work,
         )

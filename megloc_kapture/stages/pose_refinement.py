@@ -15,7 +15,14 @@ from pydantic import Field
 
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
-from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, unit_of
+from megloc_kapture.io.dataset_tables import (
+    METRES,
+    NO_TABLES,
+    SIDE_TABLES,
+    SideTables,
+    read_side_tables,
+    unit_of,
+)
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import (
@@ -43,7 +50,6 @@ from megloc_kapture.refinement.references import (
     judge_consistency,
     spread_names,
 )
-from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import write_result_tables, write_timing
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.stage import (
@@ -89,7 +95,7 @@ class MapRefiners:
     def __init__(
         self,
         mapping: KaptureFolder,
-        restrictions: Restrictions,
+        tables: SideTables,
         options: PoseRefinementOptions,
         placement: Placement = AUTO,
     ) -> None:
@@ -100,7 +106,7 @@ class MapRefiners:
                 "colmap --unit m` declares that a COLMAP model is in metres"
             )
         self.refiners = tuple(options.make_refiners(placement))
-        self.map, self._restrictions = mapping, restrictions
+        self.map, self._tables = mapping, tables
         self._verdicts: dict[str, list[Consistency | None]] = {}
         self._lock = threading.Lock()
 
@@ -108,11 +114,11 @@ class MapRefiners:
     def _by_frame(self) -> dict[str, ReferenceImages]:
         poses_of: dict[str, dict[str, RigidTransform]] = {}
         for image, pose in self.map.read().poses().items():
-            poses_of.setdefault(self._restrictions.frame(image), {})[image] = pose
+            poses_of.setdefault(self._tables.frame(image), {})[image] = pose
         return {frame: ReferenceImages(poses) for frame, poses in poses_of.items()}
 
     def _frame(self, pose: Pose) -> str:
-        return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
+        return self._tables.frame(pose.candidates[0]) if pose.candidates else ""
 
     def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
         """Test the map's consistency in the frames of these poses, once per coordinate frame."""
@@ -236,7 +242,7 @@ def refine_poses(
     output: Path,
     options: PoseRefinementOptions,
     *,
-    restrictions: Restrictions = UNRESTRICTED,
+    tables: SideTables = NO_TABLES,
     work: Work = HERE,
     timing: Path | None = None,
 ) -> dict[str, float]:
@@ -247,7 +253,7 @@ def refine_poses(
     refiner, ``map_consistency.csv`` a row per tested coordinate frame and refiner. Return counts
     for the log.
     """
-    refiners = MapRefiners(map_folder, restrictions, options, work.placement)
+    refiners = MapRefiners(map_folder, tables, options, work.placement)
     data = localized.read()
     results = _read_results(localized)
     poses = {name: result for name, result in results.items() if isinstance(result, Pose)}
@@ -334,7 +340,7 @@ class RefinePoses(PipelineStage):
             work.folder(UNREFINED_POSES),
             work.out / LOCALIZED,
             self.options.pose_refinement,
-            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
+            tables=read_side_tables(work.path(SIDE_TABLES)),
             work=work,
             timing=work.out / REFINEMENT_TIMING,
         )

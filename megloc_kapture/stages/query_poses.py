@@ -19,7 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, read_unreadable
+from megloc_kapture.io.dataset_tables import (
+    NO_TABLES,
+    SIDE_TABLES,
+    SideTables,
+    read_side_tables,
+    read_unreadable,
+)
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
@@ -33,7 +39,6 @@ from megloc_kapture.localization.map_index import PoseProblem, QueryView, TypedM
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
-from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.matches import candidates_of
 from megloc_kapture.stages.scene import (
@@ -280,7 +285,7 @@ def localize_from_matches(
     local_types: Sequence[str],
     options: LocalizationOptions,
     *,
-    restrictions: Restrictions = UNRESTRICTED,
+    tables: SideTables = NO_TABLES,
     work: Work = HERE,
     scratch: Path | None = None,
 ) -> Iterator[Pose | Failure]:
@@ -298,7 +303,7 @@ def localize_from_matches(
     jobs: list[_Job] = []
     for unit in units:
         images_of = [candidates.get(image, ()) for image, _ in unit]
-        frames = {candidate: restrictions.frame(candidate) for candidate in chain(*images_of)}
+        frames = {candidate: tables.frame(candidate) for candidate in chain(*images_of)}
         jobs.append((unit, images_of, frames))
     with shared_index(measured, scratch) as indices:
         localize = partial(_localize_stored, map_folder, query, indices, options, ranker)
@@ -349,7 +354,7 @@ class LocalizeQueries(PipelineStage):
             pairs,
             self.options.matched_types(),
             options,
-            restrictions=Restrictions.read(tables),
+            tables=read_side_tables(tables),
             work=work,
             scratch=work.out,
         )

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project, scaled_camera
-from megloc_kapture.io.dataset_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup, SideTables
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import (
     FeatureConfig,
@@ -39,7 +39,6 @@ from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
-from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions, refine_map
 from megloc_kapture.stages.scene import depth_of, depth_records, index_map
 from megloc_kapture.stages.stereo_depth import DEPTH_FILE, fuse_depth, side_file
@@ -415,7 +414,7 @@ def test_lifted_points_are_compared_with_the_depth_of_other_images(tmp_path: Pat
     hidden = rows_of(wall, LIFTED[8:])
     assert hidden < rows_of(folder)
     # images of other frames are not compared
-    alone = Restrictions({name: ImageGroup(frame=name) for name in NAMES})
-    counts = refine_map(wall, tmp_path / "apart", MapRefinementOptions(), restrictions=alone)
+    alone = SideTables(groups={name: ImageGroup(frame=name) for name in NAMES})
+    counts = refine_map(wall, tmp_path / "apart", MapRefinementOptions(), tables=alone)
     assert lifted <= rows_of(KaptureFolder(tmp_path / "apart"))
     assert counts["checked_by_depth"] < report["filters"][0]["checked"]

@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError, PluginError
-from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_priors
+from megloc_kapture.io.dataset_tables import (
+    NO_TABLES,
+    ImageGroup,
+    SideTables,
+    read_side_tables,
+    write_groups,
+    write_priors,
+)
 from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureFolder,
@@ -27,10 +34,8 @@ from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOption
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.retrieval.search import FusionOptions
 from megloc_kapture.stages.image_pairs import (
-    UNRESTRICTED,
     MappingPairsOptions,
     QueryPairsOptions,
-    Restrictions,
     Retrieval,
     pair_map_images,
     pair_queries,
@@ -153,7 +158,7 @@ def test_map_pairs_by_sequence_follow_the_times_of_a_camera(world: Any, tmp_path
     assert names(found) == [("left/0.png", "left/1.png"), *right]
 
 
-FRAMES = Restrictions(
+FRAMES = SideTables(
     groups={
         image: ImageGroup(frame="a" if k % 2 else "b") for k, image in enumerate(sorted(VECTORS))
     }
@@ -168,7 +173,7 @@ def test_frames_never_mix(world: Any, folders: Folders, by: Any) -> None:
         folders[0],
         MappingPairsOptions(by=by, covisibility={"top_k": 1}),
         retrieval=BY_TOY,
-        restrictions=FRAMES,
+        tables=FRAMES,
         covisible=world.map(),
     )
     images = sorted(world.map_poses)
@@ -302,19 +307,17 @@ GROUPS = {
 }
 
 
-def pools(restrictions: Restrictions, queries: list[str]) -> dict[str, list[int]]:
+def pools(tables: SideTables, queries: list[str]) -> dict[str, list[int]]:
     return {
         queries[at]: images.tolist()
-        for positions, images in restrictions.pools(queries, IMAGES)
+        for positions, images in tables.pools(queries, IMAGES)
         for at in positions
     }
 
 
 def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
     everything = {"free": [0, 1, 2, 3]}
-    assert (
-        pools(UNRESTRICTED, ["free"]) == pools(Restrictions.read(tmp_path), ["free"]) == everything
-    )
+    assert pools(NO_TABLES, ["free"]) == pools(read_side_tables(tmp_path), ["free"]) == everything
     write_groups(tmp_path, GROUPS)
     priors = {
         "by location": ["001/rear"],
@@ -324,10 +327,10 @@ def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
         "by nothing": ["099/rear"],
     }
     write_priors(tmp_path, priors)
-    frames = [members.tolist() for members in Restrictions(GROUPS).frames(IMAGES)]
+    frames = [members.tolist() for members in SideTables(groups=GROUPS).frames(IMAGES)]
     assert frames == [[3], [0, 1], [2]]
-    assert [members.tolist() for members in UNRESTRICTED.frames(IMAGES)] == [[0, 1, 2, 3]]
-    assert pools(Restrictions.read(tmp_path), [*priors, "free"]) == {
+    assert [members.tolist() for members in NO_TABLES.frames(IMAGES)] == [[0, 1, 2, 3]]
+    assert pools(read_side_tables(tmp_path), [*priors, "free"]) == {
         "by location": [0, 2],
         "by frame": [0, 1],
         "by image": [3],

@@ -17,7 +17,7 @@ from megloc_kapture.errors import PluginError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
-from megloc_kapture.io.dataset_tables import ImageGroup
+from megloc_kapture.io.dataset_tables import ImageGroup, SideTables
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
@@ -37,7 +37,6 @@ from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PoseHypothesis, PoseRefinement, RankingScene
 from megloc_kapture.refinement.references import DISPLACEMENT
-from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
 from megloc_kapture.stages.query_poses import LocalizationOptions, StoredSource, localize_query
@@ -342,7 +341,7 @@ def folders(world: Any, small_kapture: Any, tmp_path: Path) -> tuple[KaptureFold
     return mapping, query, KaptureFolder(tmp_path / "localized")
 
 
-RESTRICTIONS = Restrictions(
+TABLES = SideTables(
     groups={f"{k:02d}.png": ImageGroup(frame="good" if k < 6 else "bad") for k in range(12)}
 )
 
@@ -350,7 +349,7 @@ RESTRICTIONS = Restrictions(
 def test_each_coordinate_frame_has_its_consistency(folders: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = Chosen(refiners=(Sure(),))
-    counts = refine_poses(*folders, out, options, restrictions=RESTRICTIONS)
+    counts = refine_poses(*folders, out, options, tables=TABLES)
     assert counts == {
         "queries": 2, "accepted_by_sure": 1, "frames_where_sure_is_trusted": 1,
     }  # fmt: skip
@@ -367,6 +366,6 @@ def test_each_coordinate_frame_has_its_consistency(folders: Any, tmp_path: Path)
     assert consistency_sentence(good).startswith("sure in good is used; 6 map images held out")
     # without the check the refiner is used everywhere
     options = Chosen(refiners=(Sure(require_consistent_map=False),))
-    counts = refine_poses(*folders, tmp_path / "all", options, restrictions=RESTRICTIONS)
+    counts = refine_poses(*folders, tmp_path / "all", options, tables=TABLES)
     assert counts == {"queries": 2, "accepted_by_sure": 2}
     assert not (tmp_path / "all" / CONSISTENCY_FILE).exists()
