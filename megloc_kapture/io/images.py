@@ -263,18 +263,17 @@ class Photo:
     """
 
     camera: Camera
-    orientation: int
-    make: str
+    orientation: int = 1
+    make: str = ""
     gps: tuple[float, float, float] | None = None
 
     @property
     def upright_camera(self) -> Camera:
         """Return the camera of the pixels after :func:`turned_upright`."""
-        width, height = self.camera.width, self.camera.height
-        if self.orientation >= 5:
-            width, height = height, width
-        deviation = self.camera.focal_deviation
-        return _centred(width, height, self.camera.params[0], deviation)
+        camera = self.camera
+        if self.orientation < 5:
+            return camera
+        return _centred(camera.height, camera.width, camera.params[0], camera.focal_deviation)
 
 
 def guessed_camera(width: int, height: int) -> Camera:

@@ -8,7 +8,7 @@ import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from megloc_kapture.io.images import (
     UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,
     WRITABLE_SUFFIXES,
+    Photo,
     extract_frames,
     guessed_camera,
     image_size,
@@ -295,16 +296,6 @@ def _stored_features(stored: MapKeypoints, image: str) -> LocalFeatures:
     return LocalFeatures(keypoints_px, scores, stored.descriptors(image))
 
 
-@dataclass(frozen=True)
-class _Image:
-    path: Path
-    camera: Camera
-    orientation: int
-    make: str
-    is_frame: bool
-    gps: tuple[float, float, float] | None = None
-
-
 class Photographs(Queries):
     """Photographs and videos, as queries or as input for a map.
 
@@ -349,7 +340,8 @@ class Photographs(Queries):
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
         self._scaled: list[tuple[Camera, Camera]] = []
         videos = [name for name in files if Path(name).suffix.lower() in VIDEO_SUFFIXES]
-        self._images: dict[str, _Image] = {}
+        self._paths: dict[str, Path] = {}
+        self._photos: dict[str, Photo] = {}
         self._frames: tempfile.TemporaryDirectory[str] | None = None
         for name, path in files.items():
             try:
@@ -359,7 +351,7 @@ class Photographs(Queries):
                     self._add(name, path, camera)
             except DataError as error:
                 self.unreadable[name] = error.message
-        self.names = sorted(self._images)
+        self.names = sorted(self._photos)
         warn_of_scaled(roots[0], self._scaled)
         if self.names and self.without_row == self.names:
             raise OptionError(
@@ -368,7 +360,7 @@ class Photographs(Queries):
             )
 
     def known_cameras(self) -> bool:
-        return all(image.camera.focal_deviation == 0 for image in self._images.values())
+        return all(photo.camera.focal_deviation == 0 for photo in self._photos.values())
 
     def describe(self) -> str:
         """Describe images that are missing from the camera list, if any."""
@@ -382,59 +374,55 @@ class Photographs(Queries):
         )
 
     def query(self, name: str) -> Query:
-        image = self._images[name]
-        return Query(image.camera, image.path, name, orientation=image.orientation)
+        photo, path = self._photos[name], self._paths[name]
+        return Query(photo.upright_camera, path, name, orientation=photo.orientation)
 
     def gps(self) -> dict[str, tuple[float, float, float]]:
-        return {name: image.gps for name, image in self._images.items() if image.gps is not None}
+        return {name: photo.gps for name, photo in self._photos.items() if photo.gps is not None}
 
     def files(self) -> dict[str, Path]:
-        return {name: self._images[name].path for name in self.names}
+        return {name: self._paths[name] for name in self.names}
 
     def data(self) -> KaptureData:
         data = KaptureData()
         sensor_ids: dict[tuple[str, Camera], str] = {}
         for timestamp, name in enumerate(self.names):
-            image = self._images[name]
+            photo = self._photos[name]
+            camera = photo.upright_camera
             # frames of a video share a camera; so do photographs of one size without EXIF
-            made_by = name.rpartition("/")[0] if image.is_frame else image.make
-            sensor_id = sensor_ids.setdefault((made_by, image.camera), f"camera{len(sensor_ids)}")
+            made_by = name.rpartition("/")[0] if self._is_frame(name) else photo.make
+            sensor_id = sensor_ids.setdefault((made_by, camera), f"camera{len(sensor_ids)}")
             title = made_by.replace(",", " ")
-            data.sensors[sensor_id] = Sensor.from_camera(image.camera, name=title)
+            data.sensors[sensor_id] = Sensor.from_camera(camera, name=title)
             data.records_camera[timestamp, sensor_id] = name
         return data
 
     def write_images(self, output: Path) -> None:
-        for name, image in self._images.items():
+        for name, photo in self._photos.items():
+            path = self._paths[name]
             place = Path(output) / "sensors" / "records_data" / name
             place.parent.mkdir(parents=True, exist_ok=True)
-            if image.is_frame:
-                hard_link(image.path, place)
-            elif image.orientation == 1:
-                link_file(image.path, place)
+            if self._is_frame(name):
+                hard_link(path, place)
+            elif photo.orientation == 1:
+                link_file(path, place)
             else:
                 try:
-                    pixels = read_image_rgb(image.path)
+                    pixels = read_image_rgb(path)
                 except DataError:  # reported in status.csv
                     continue
-                write_image(place, turned_upright(pixels, image.orientation))
+                write_image(place, turned_upright(pixels, photo.orientation))
 
-    def _add(
-        self,
-        name: str,
-        path: Path,
-        given: Camera | Mapping[str, Camera] | None,
-        *,
-        is_frame: bool = False,
-    ) -> None:
+    def _is_frame(self, name: str) -> bool:
+        """Return whether an image is a frame of a video, in the temporary folder of frames."""
+        return self._frames is not None and self._paths[name].is_relative_to(self._frames.name)
+
+    def _add(self, name: str, path: Path, given: Camera | Mapping[str, Camera] | None) -> None:
         camera = given if isinstance(given, Camera) else self._calibrated.get(name)
         if isinstance(given, Mapping):
             camera = find_camera(given, name, path)
         if camera is None:
-            photo = read_photo(path)
-            self._images[name] = _Image(
-                path, photo.upright_camera, photo.orientation, photo.make, is_frame, photo.gps
-            )
+            self._photos[name], self._paths[name] = read_photo(path), path
             if given is not None:
                 self.without_row.append(name)
             return
@@ -443,7 +431,7 @@ class Photographs(Queries):
             self._scaled.append((camera, scaled_camera(camera, *size)))
             camera = self._scaled[-1][1]
         check_image_size(path, camera)
-        self._images[name] = _Image(path, camera, 1, "", is_frame)
+        self._photos[name], self._paths[name] = Photo(camera), path
 
     def _add_video(
         self, name: str, path: Path, camera: Camera | Mapping[str, Camera] | None, every: int
@@ -452,7 +440,7 @@ class Photographs(Queries):
             self._frames = tempfile.TemporaryDirectory(prefix=TEMPORARY)
         folder = Path(self._frames.name) / name
         for frame in extract_frames(path, folder, every):
-            self._add(f"{name}/{frame}", folder / frame, camera, is_frame=True)
+            self._add(f"{name}/{frame}", folder / frame, camera)
 
 
 def _calibrated(root: Path) -> dict[str, Camera]:
