@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.io.dataset_tables import (
+    NO_TABLES,
     ImageGroup,
     Protocol,
     RelocalizationPair,
+    SideTables,
     SimilarityTransform,
     World,
     read_groups,
@@ -21,6 +23,7 @@ from megloc_kapture.io.dataset_tables import (
     read_priors,
     read_protocol,
     read_relocalization,
+    read_side_tables,
     read_world,
     write_groups,
     write_names,
@@ -107,3 +110,44 @@ def test_a_pose_sees_the_same_directions_in_the_official_and_the_local_world(
     np.testing.assert_allclose(seen, scale * pose.apply(local), atol=1e-8)
     back = world.pose_in_local(in_official)
     np.testing.assert_allclose(back.apply(local), pose.apply(local), atol=1e-8)
+
+
+IMAGES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+GROUPS = {
+    "a.jpg": ImageGroup(location="001/rear", frame="DUC1"),
+    "b.jpg": ImageGroup(location="001/left", frame="DUC1"),
+    "c.jpg": ImageGroup(location="001/rear", frame="DUC2"),
+}
+
+
+def pools(tables: SideTables, queries: list[str]) -> dict[str, list[int]]:
+    return {
+        queries[at]: images.tolist()
+        for positions, images in tables.pools(queries, IMAGES)
+        for at in positions
+    }
+
+
+def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
+    everything = {"free": [0, 1, 2, 3]}
+    assert pools(NO_TABLES, ["free"]) == pools(read_side_tables(tmp_path), ["free"]) == everything
+    write_groups(tmp_path, GROUPS)
+    priors = {
+        "by location": ["001/rear"],
+        "by frame": ["DUC1"],
+        "by image": ["d.jpg"],
+        "by several": ["d.jpg", "001/rear", "a.jpg"],
+        "by nothing": ["099/rear"],
+    }
+    write_priors(tmp_path, priors)
+    frames = [members.tolist() for members in SideTables(groups=GROUPS).frames(IMAGES)]
+    assert frames == [[3], [0, 1], [2]]
+    assert [members.tolist() for members in NO_TABLES.frames(IMAGES)] == [[0, 1, 2, 3]]
+    assert pools(read_side_tables(tmp_path), [*priors, "free"]) == {
+        "by location": [0, 2],
+        "by frame": [0, 1],
+        "by image": [3],
+        "by several": [0, 2, 3],
+        "by nothing": [],
+        "free": [0, 1, 2, 3],
+    }

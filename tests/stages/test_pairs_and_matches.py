@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError, PluginError
-from megloc_kapture.io.dataset_tables import (
-    NO_TABLES,
-    ImageGroup,
-    SideTables,
-    read_side_tables,
-    write_groups,
-    write_priors,
-)
+from megloc_kapture.io.dataset_tables import ImageGroup, SideTables
 from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureFolder,
@@ -297,47 +290,6 @@ def test_several_global_features_are_fused_with_their_weights(
     assert names([first, last]) == [("query/a.png", "left/1.png"), ("query/b.png", "right/3.png")]
     assert first.score == pytest.approx(0.25 * similarity("query/a.png", "left/1.png") + 0.75)
     assert last.score == pytest.approx(0.25 * similarity("query/b.png", "right/3.png"))
-
-
-IMAGES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
-GROUPS = {
-    "a.jpg": ImageGroup(location="001/rear", frame="DUC1"),
-    "b.jpg": ImageGroup(location="001/left", frame="DUC1"),
-    "c.jpg": ImageGroup(location="001/rear", frame="DUC2"),
-}
-
-
-def pools(tables: SideTables, queries: list[str]) -> dict[str, list[int]]:
-    return {
-        queries[at]: images.tolist()
-        for positions, images in tables.pools(queries, IMAGES)
-        for at in positions
-    }
-
-
-def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
-    everything = {"free": [0, 1, 2, 3]}
-    assert pools(NO_TABLES, ["free"]) == pools(read_side_tables(tmp_path), ["free"]) == everything
-    write_groups(tmp_path, GROUPS)
-    priors = {
-        "by location": ["001/rear"],
-        "by frame": ["DUC1"],
-        "by image": ["d.jpg"],
-        "by several": ["d.jpg", "001/rear", "a.jpg"],
-        "by nothing": ["099/rear"],
-    }
-    write_priors(tmp_path, priors)
-    frames = [members.tolist() for members in SideTables(groups=GROUPS).frames(IMAGES)]
-    assert frames == [[3], [0, 1], [2]]
-    assert [members.tolist() for members in NO_TABLES.frames(IMAGES)] == [[0, 1, 2, 3]]
-    assert pools(read_side_tables(tmp_path), [*priors, "free"]) == {
-        "by location": [0, 2],
-        "by frame": [0, 1],
-        "by image": [3],
-        "by several": [0, 2, 3],
-        "by nothing": [],
-        "free": [0, 1, 2, 3],
-    }
 
 
 def all_pairs(first: list[str], second: list[str]) -> list[ImagePair]:
