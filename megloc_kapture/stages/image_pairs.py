@@ -108,25 +108,6 @@ def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[
     return [KaptureVectors(reader, images) for reader in readers]
 
 
-def most_similar(
-    queries: Sequence[VectorRows],
-    database: Sequence[VectorRows],
-    permitted: NDArray[np.int64],
-    retrieval: Retrieval,
-    top_k: int,
-) -> Ranking:
-    """Return the most similar images of each query, best first, and their scores, both (Q, K).
-
-    Parameters
-    ----------
-    queries, database : unit vectors (Q, D) and (M, D) by type.
-    permitted : indices (M,) of the database's images; the result has these indices, or -1 where
-        images are too few.
-    """
-    index, scores = retrieval.rank(queries, database, top_k)
-    return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
-
-
 PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
 
 
@@ -268,13 +249,14 @@ def pair_queries(
     database, described = retrieval.readers(mapping), retrieval.readers(query)
     for positions, permitted in pools:
         asked = vectors_of(described, [queries[at] for at in positions])
-        vectors = vectors_of(database, [images[member] for member in permitted.tolist()])
-        index, scores = most_similar(asked, vectors, permitted, retrieval, options.top_k)
+        members = [images[member] for member in permitted.tolist()]
+        vectors = vectors_of(database, members)
+        index, scores = retrieval.rank(asked, vectors, options.top_k)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
             of_query[at] = [
-                ImagePair(queries[at], images[i], score)
+                ImagePair(queries[at], members[i], score)
                 for i, score in zip(row, row_scores, strict=True)
-                if i >= 0
+                if i >= 0  # -1 where images are too few
             ]
     return list(chain(*of_query))
 

@@ -138,7 +138,14 @@ class MapRefiners:
     def tested(self) -> list[ConsistencyRow]:
         """Return the rows of ``map_consistency.csv``."""
         return [
-            _consistency_row(frame, refiner.name, verdict)
+            ConsistencyRow(
+                frame,
+                refiner.name,
+                verdict.images,
+                verdict.contradicting,
+                **verdict.medians,
+                reason=verdict.reason,
+            )
             for number, refiner in enumerate(self.refiners)
             for frame, verdicts in sorted(self._verdicts.items())
             if (verdict := verdicts[number]) is not None
@@ -173,17 +180,6 @@ def _hold_out(
 ) -> dict[str, float] | None:
     displacement: dict[str, float] | None = refiner.hold_out(image, images, KaptureScene(mapping))
     return displacement
-
-
-def _consistency_row(frame: str, method: str, consistency: Consistency) -> ConsistencyRow:
-    return ConsistencyRow(
-        frame,
-        method,
-        consistency.images,
-        consistency.contradicting,
-        **consistency.medians,
-        reason=consistency.reason,
-    )
 
 
 def apply_refiners(
