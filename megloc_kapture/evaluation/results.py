@@ -5,7 +5,6 @@ from __future__ import annotations
 import os.path
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -59,6 +58,7 @@ class ResultContext:
     Attributes
     ----------
     queries, mapping : images and cameras, with keypoints and matches; the map has poses.
+    frames : image -> its coordinate frame, if the dataset has several.
     refinements : query -> steps of refining its pose.
     consistency : checks of refiners on the map's own images.
     localized : image -> pose, of results in memory.
@@ -67,18 +67,12 @@ class ResultContext:
 
     queries: KaptureFolder | None = None
     mapping: KaptureFolder | None = None
-    side_tables: Path | None = None
+    frames: Mapping[str, str] = field(default_factory=dict)
     refinements: Mapping[str, Sequence[PoseRefinement]] = field(default_factory=dict)
     consistency: Sequence[ConsistencyRow] = ()
     localized: Mapping[str, Pose] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     unit: str = METRES
-
-    @cached_property
-    def frames(self) -> dict[str, str]:
-        """Image -> its coordinate frame, if the dataset has several."""
-        groups = {} if self.side_tables is None else read_groups(self.side_tables)
-        return {image: group.frame for image, group in groups.items() if group.frame}
 
     def map_poses(self) -> dict[str, RigidTransform]:
         return {} if self.mapping is None else self.mapping.read().poses()
@@ -108,13 +102,14 @@ def side_tables_near(result: Path | str) -> Path | None:
 def context_of(result: Path | str, *, mapping: Path | str | None = None) -> ResultContext:
     """Find the data around a result; ``mapping`` replaces the workspace's map."""
     workspace, folder = workspace_of(result), Path(result)
-    features, candidates, maps = [], [folder], []
+    features, candidates, maps, groups = [], [folder], [], {}
     if workspace is not None:
         # matches of a guided pyramid replace those of pairs with few matches
         pyramids = [workspace / name for name in (_QUERY_PYRAMID, _MAPPING_PYRAMID)]
         features = [workspace, *filter(Path.is_dir, pyramids), workspace / _QUERY_MATCHES]
         candidates = [workspace / _PREPARED / _QUERY, workspace / _QUERY, folder]
         maps = [workspace / name for name in _MAPS]
+        groups = read_groups(workspace / SIDE_TABLES)
     queries = next((path for path in candidates if (path / _SENSORS).is_file()), None)
     map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
     if mapping is not None:
@@ -122,7 +117,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
     return ResultContext(
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
-        side_tables=None if workspace is None else workspace / SIDE_TABLES,
+        frames={image: group.frame for image, group in groups.items() if group.frame},
         refinements=_if_there(_read_refinement, folder / tables.REFINEMENT_FILE) or {},
         consistency=_if_there(tables.read_consistency, folder / tables.CONSISTENCY_FILE) or (),
         unit=unit_of(result),

@@ -21,7 +21,6 @@ from megloc_kapture.evaluation.report.queries import legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.view import render_view, view_data
-from megloc_kapture.io.dataset_tables import ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.points import write_points3d
@@ -204,14 +203,13 @@ def test_coordinate_frames_are_separate(world: Any, make_map: Any) -> None:
         replace(q, candidates=("m/2.jpg",) * (k % 2))
         for k, q in enumerate(shown_queries(evaluation))
     ]
-    floors = {name: ImageGroup(frame=f"DUC{1 + k // 2}") for k, name in enumerate(names)}
-    write_groups(root / "tables", floors)
-    data, _ = drawn(root, shown, side_tables=root / "tables")
+    floors = {name: f"DUC{1 + k // 2}" for k, name in enumerate(names)}
+    data, _ = drawn(root, shown, frames=floors)
     assert data["frames"] == ["DUC1", "DUC2"]
     assert data["pointFrames"].tolist() == [0, 1, 1]
     assert data["cameraFrames"].tolist() == [0, 0, 1, 1]
     assert data["queryFrames"].tolist() == [k % 2 for k in range(len(shown))]
-    assert "DUC2</option>" in page_of(root, shown, side_tables=root / "tables")
+    assert "DUC2</option>" in page_of(root, shown, frames=floors)
     assert 'id="frame"' not in page_of(root, shown)
     assert view_data(ResultContext()) is None
 
