@@ -346,10 +346,12 @@ def _collect(
         for _, point in sorted(reconstruction.points3D.items())
     ]
     tracks.sort(key=lambda pair: pair[0])
-    seen = [(row, *e) for row, (track, _) in enumerate(tracks) for e in track]
+    lengths = np.array([len(track) for track, _ in tracks], dtype=np.int64)
+    point_ids = np.repeat(np.arange(len(tracks)), lengths)
+    flat = np.array([e for track, _ in tracks for e in track], dtype=np.int64).reshape(-1, 2)
     xyz = np.array([p.xyz for _, p in tracks], dtype=np.float64).reshape(-1, 3) + offset
     errors_px = np.array([p.error for _, p in tracks], dtype=np.float64)
-    return xyz, errors_px, np.array(seen, dtype=np.int64).reshape(-1, 3)
+    return xyz, errors_px, np.column_stack([point_ids, flat])
 
 
 def write_model(
