@@ -27,7 +27,7 @@ from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
-from megloc_kapture.pipeline.live_source import MapMatching, local_types_of
+from megloc_kapture.pipeline.live_source import MapMatching
 from megloc_kapture.pipeline.presets import (
     BASIC_OPTIONS,
     DEFAULT_PRESET,
@@ -194,9 +194,7 @@ def describe_retrieval(opened: KaptureMap) -> None:
         if missing and not (keypoints.extractor() and opened.has_images()):
             line("retrieval", "not possible without the map's descriptors")
             return
-    options = options_of_preset(DEFAULT_PRESET)
-    types = local_types_of(opened, options)
-    retrieval = MapMatching(opened, options, types)
+    retrieval = MapMatching(opened, options_of_preset(DEFAULT_PRESET))
     line("retrieval", retrieval.describe_candidates(()))
     if brought := opened.global_types:
         text = retrieval.describe_candidates(brought)

@@ -300,13 +300,9 @@ class MapMatching:
     Missing vectors of map images are computed in memory.
     """
 
-    def __init__(
-        self,
-        kapture_map: KaptureMap,
-        options: PipelineOptions,
-        types: Sequence[LocalType],
-    ) -> None:
-        self._map, self.options, self.types = kapture_map, options, types
+    def __init__(self, kapture_map: KaptureMap, options: PipelineOptions) -> None:
+        self._map, self.options = kapture_map, options
+        self.types = local_types_of(kapture_map, options)
         masks = options.preprocessing.masks
         check_option(
             masks == MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError, check_option
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
+from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.stages.localized_folder import unreadable_image
@@ -67,8 +67,8 @@ class Localizer:
             self.options.pose_refinement,
             self.options.placement,
         )
-        self.types = local_types_of(kapture_map, self.options)
-        self.matching = MapMatching(kapture_map, self.options, self.types)
+        self.matching = MapMatching(kapture_map, self.options)
+        self.types = self.matching.types
         for local in self.types:
             local.prepare()
 
