@@ -182,24 +182,14 @@ def _sorted_names(folder: Path) -> list[str]:
     return sorted(os.listdir(folder)) if folder.is_dir() else []
 
 
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """Poses ``cam_from_world`` by image, in model order, and locations by image where known."""
-
-    poses: Mapping[ImageKey, RigidTransform]
-    locations: Mapping[ImageKey, str]
-    merged: bool
-
-
 def read_reference(
     layout: Layout, model: ModelChoice, wanted: Sequence[str], missing: Missing
-) -> Reference:
-    """Read poses and locations of the reference images.
+) -> tuple[dict[ImageKey, RigidTransform], dict[ImageKey, str]]:
+    """Read ``cam_from_world`` of the reference images, in model order, and known locations.
 
     The individual models share a world frame; an image of several models belongs to the first.
     """
     individual = layout.individual_models()
-    merged = layout.is_merged(model)
     locations: dict[ImageKey, str] = {}
     located_poses: dict[ImageKey, RigidTransform] = {}
     for location, folder in individual.items():
@@ -208,22 +198,21 @@ def read_reference(
         for key, image in zip(keys, model_images, strict=True):
             locations.setdefault(key, location)
             located_poses.setdefault(key, image.cam_from_world)
-    if not merged:
+    if not layout.is_merged(model):
         for location in wanted:
             missing.require(layout.individual_model(location))
-        poses = located_poses
-    else:
-        poses = {}
-        if missing.require(layout.merged_model):
-            nvm = read_nvm(layout.merged_model, with_points=False)
-            for index, key in enumerate(_keys(nvm.names, layout.merged_model)):
-                poses[key] = nvm.cam_from_world(index)
-    return Reference(poses, locations, merged)
+        return located_poses, locations
+    poses: dict[ImageKey, RigidTransform] = {}
+    if missing.require(layout.merged_model):
+        nvm = read_nvm(layout.merged_model, with_points=False)
+        for index, key in enumerate(_keys(nvm.names, layout.merged_model)):
+            poses[key] = nvm.cam_from_world(index)
+    return poses, locations
 
 
-def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], SparsePoints]:
+def read_points(layout: Layout, choice: ModelChoice) -> tuple[list[ImageKey], SparsePoints]:
     """Read images and points of the merged model, or of all individual models concatenated."""
-    if merged:
+    if layout.is_merged(choice):
         nvm = read_nvm(layout.merged_model, with_points=True)
         return _keys(nvm.names, layout.merged_model), nvm.points
     positions: dict[ImageKey, int] = {}

@@ -148,11 +148,11 @@ class RobotCar:
         reference = read_reference(layout, self.options.model, wanted, missing)
         cameras = {camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))}
         find = image_finder(layout, missing)
-        selection = select(version, reference, queries, cameras=cameras, find=find, **chosen)
+        selection = select(version, *reference, queries, cameras=cameras, find=find, **chosen)
         remarks: list[str] = []
         model, database = None, None
         if self.options.reference_model:
-            model = partial(_read_points, layout, selection)
+            model = partial(_read_points, layout, selection, options.model)
             database = published_database(layout.feature_database, remarks)
         return self._dataset(
             selection,
@@ -178,7 +178,7 @@ class RobotCar:
         reference, car = reference_of_kapture(images), car_of_kapture(form, images)
         paths = {key: image.name for key, image in images.items()}
         selection = select(
-            version, reference, queries, cameras=car.sensors, find=paths.get, **chosen
+            version, *reference, queries, cameras=car.sensors, find=paths.get, **chosen
         )
         remarks = [f"Read from kapture folders, as version {version}."]
         if version == 2 and not test_list.is_file():
@@ -205,7 +205,7 @@ class RobotCar:
         reference_images: int,
         **more: Any,
     ) -> OfficialDataset:
-        car = with_rig_of_model(car, selection.reference)
+        car = with_rig_of_model(car, selection.map_poses)
         mapping, query = mapping_data(selection, car), with_images(car, selection.query_images)
         published, _ = read_ground_truth(missing.root, query, World())  # names have conditions
         groups = _image_groups(selection)
@@ -241,8 +241,10 @@ def _kapture_form(root: Path) -> KaptureForm | None:
     return KaptureForm.find(root, with_locations=True) if Layout(root).absent() else None
 
 
-def _read_points(layout: Layout, selection: Selection) -> tuple[list[str], SparsePoints]:
-    images, points = read_points(layout, merged=selection.reference.merged)
+def _read_points(
+    layout: Layout, selection: Selection, model: ModelChoice
+) -> tuple[list[str], SparsePoints]:
+    images, points = read_points(layout, model)
     # missing images stay in the list: the points refer to positions in it
     return [selection.map_images.get(image, f"{image.path}.jpg") for image in images], points
 
@@ -251,7 +253,7 @@ def _image_groups(selection: Selection) -> dict[str, ImageGroup]:
     locations = selection.queries.locations
     groups = {}
     for image, path in selection.map_images.items():
-        location = _location(image.camera, selection.reference.locations.get(image))
+        location = _location(image.camera, selection.map_locations.get(image))
         groups[path] = ImageGroup(condition=image.condition, location=location, scored=False)
     for image, path in (*selection.train_images.items(), *selection.query_images.items()):
         groups[path] = ImageGroup(
@@ -294,12 +296,12 @@ def _pose_file_names(selection: Selection) -> dict[str, str]:
 
 
 def _summary(selection: Selection, reference_images: int) -> list[Count]:
-    queries, reference = selection.queries, selection.reference
+    queries = selection.queries
     locations = {location for listed in queries.locations.values() for location in listed}
     counts = [
         Count("locations with queries", len(locations), _NUM_LOCATIONS),
         Count("reference images", reference_images, _NUM_REFERENCE_IMAGES),
-        Count("reference images with a pose", len(reference.poses), _NUM_REGISTERED),
+        Count("reference images with a pose", len(selection.map_poses), _NUM_REGISTERED),
         Count("query images", len(queries.locations), _NUM_QUERIES),
     ]
     counted = Counter((image.condition, image.camera) for image in queries.locations)
@@ -319,7 +321,7 @@ def _summary(selection: Selection, reference_images: int) -> list[Count]:
 
 def _remarks(selection: Selection) -> list[str]:
     remarks = []
-    unknown = sum(image not in selection.reference.locations for image in selection.map_images)
+    unknown = sum(image not in selection.map_locations for image in selection.map_images)
     if unknown:
         folder = Layout(Path()).individual_model("NNN")
         remarks.append(

@@ -16,7 +16,6 @@ from megloc_kapture.datasets.robotcar import (
     ImageKey,
     Layout,
     Queries,
-    Reference,
     known_queries,
     parse_image,
     read_intrinsics,
@@ -37,10 +36,15 @@ _SIZE_PX = (1024, 1024)
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The existing images, with paths below ``images/``; ``train_images`` are added to the map."""
+    """The existing images, with paths below ``images/``; ``train_images`` are added to the map.
+
+    ``map_poses`` are ``cam_from_world`` of all reference images, ``map_locations`` their locations
+    where known.
+    """
 
     version: int
-    reference: Reference
+    map_poses: Mapping[ImageKey, RigidTransform]
+    map_locations: Mapping[ImageKey, str]
     queries: Queries
     map_images: Mapping[ImageKey, str]
     train_images: Mapping[ImageKey, str]
@@ -55,7 +59,8 @@ class Selection:
 
 def select(
     version: int,
-    reference: Reference,
+    map_poses: Mapping[ImageKey, RigidTransform],
+    map_locations: Mapping[ImageKey, str],
     queries: Queries,
     *,
     part: str,
@@ -83,9 +88,10 @@ def select(
 
     return Selection(
         version,
-        reference,
+        map_poses,
+        map_locations,
         queries,
-        map_images=with_paths(reference.poses),
+        map_images=with_paths(map_poses),
         train_images=with_paths(train),
         query_images=with_paths(wanted),
     )
@@ -96,9 +102,9 @@ def _of_moments(images: Iterable[ImageKey], others: Iterable[ImageKey]) -> list[
     return [image for image in images if (image.condition, image.timestamp) in moments]
 
 
-def with_rig_of_model(car: KaptureData, reference: Reference) -> KaptureData:
+def with_rig_of_model(car: KaptureData, poses: Mapping[ImageKey, RigidTransform]) -> KaptureData:
     """Return the car with a rig estimated from the model's poses, if these suffice."""
-    members = rig_of_model(reference.poses)
+    members = rig_of_model(poses)
     fits = members and set(members) <= set(car.sensors)
     return replace(car, rigs={RIG_ID: members}) if fits else car
 
@@ -135,7 +141,7 @@ def read_car(layout: Layout, selection: Selection, missing: Missing) -> KaptureD
 def mapping_data(selection: Selection, car: KaptureData) -> KaptureData:
     """Return the map's images; each has a separate pose, because no rig fits the poses exactly."""
     images = {**selection.map_images, **selection.train_images}
-    poses = {**selection.reference.poses, **selection.queries.train}
+    poses = {**selection.map_poses, **selection.queries.train}
     return with_poses(with_images(car, images), {_record(image): poses[image] for image in images})
 
 
@@ -219,13 +225,16 @@ def car_of_kapture(form: KaptureForm, images: Mapping[ImageKey, KaptureImage]) -
     return KaptureData(sensors, {RIG_ID: members} if members else {})
 
 
-def reference_of_kapture(images: Mapping[ImageKey, KaptureImage]) -> Reference:
+def reference_of_kapture(
+    images: Mapping[ImageKey, KaptureImage],
+) -> tuple[dict[ImageKey, RigidTransform], dict[ImageKey, str]]:
+    """Return ``cam_from_world`` and locations of the reference images."""
     poses = {
         key: image.cam_from_world
         for key, image in images.items()
         if key.condition == REFERENCE_CONDITION and image.cam_from_world is not None
     }
-    return Reference(poses, {key: images[key].locations[0] for key in poses}, merged=False)
+    return poses, {key: images[key].locations[0] for key in poses}
 
 
 def queries_of_kapture(
