@@ -28,6 +28,7 @@ from megloc_kapture.plugins import (
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, QueryPairsOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
+from megloc_kapture.stages.matches import SecondMatchingOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
@@ -66,6 +67,12 @@ _MODERN = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(
         LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05}),
+    ),
+    # only weak pairs of map images, so that queries cost no more
+    second_matching=SecondMatchingOptions(
+        matcher=PluginChoice(name="lightglue", options={"weights": "aliked_lightglue"}),
+        min_matches=100,
+        queries=False,
     ),
 )
 # all weights have a free licence, and must be downloaded
@@ -252,13 +259,14 @@ def check_weights(options: PipelineOptions) -> None:
 
 
 def _missing(options: PipelineOptions) -> MissingWeightsError | None:
-    features = options.local_features
+    features, second = options.local_features, options.second_matching
+    rematches = options.triangulates() or second.queries
     matchers = [choice.matching or options.matching for choice in features]
     chosen: list[tuple[str, PluginChoice | None]] = [
         (SEGMENTERS, options.preprocessing.masks.segmenter),
         *((LOCAL_FEATURES, plugin) for plugin in features),
         *((MATCHERS, plugin) for plugin in matchers),
-        (MATCHERS, options.second_matching.matcher),
+        (MATCHERS, second.matcher if rematches else None),
         (POSE_RANKERS, options.localization.rank),
         *((POSE_REFINERS, plugin) for plugin in options.pose_refinement.by),
     ]

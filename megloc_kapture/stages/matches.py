@@ -94,8 +94,7 @@ class SecondMatchingOptions(Options):
     min_matches: int | None = Field(
         default=None,
         gt=0,
-        description="match again only pairs that have verified matches, but fewer than this; "
-        "none: all",
+        description="match again only pairs with fewer verified matches; none: all",
     )
     queries: bool = Field(
         default=True, description="also match queries again; false: only map images"
@@ -195,12 +194,11 @@ def pairs_to_rematch(
     """Return the pairs of the second matching, from the number of verified matches of all pairs.
 
     These are the ``pairs`` best of each first image; with ``min_matches``, the best of those with
-    fewer matches but at least one, since images without matches seldom overlap.
-    With ``of_both``, also those of each second image; a pair then counts for both of its images.
-    Ties are broken by name, and the result is sorted by name.
+    fewer matches. With ``of_both``, also those of each second image; a pair then counts for both of
+    its images. Ties are broken by name, and the result is sorted by name.
     """
     limit = options.min_matches
-    eligible = [pair for pair, n in verified.items() if limit is None or 0 < n < limit]
+    eligible = [pair for pair, n in verified.items() if limit is None or n < limit]
     chosen: set[tuple[str, str]] = set()
     taken: Counter[str] = Counter()
     for pair in sorted(eligible, key=lambda pair: (-verified[pair], pair)):

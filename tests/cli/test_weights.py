@@ -25,6 +25,7 @@ def saved(value: float) -> bytes:
 
 
 FREE, BOUND, UNKNOWN = saved(1.0), saved(2.0), saved(3.0)
+OF_MODERN = ("aliked-n16", "aliked_lightglue")
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -37,7 +38,7 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Folder of a local server, and a registry of its files."""
     folder = tmp_path / "served"
     folder.mkdir()
-    files = {"free": FREE, "bound": BOUND, "unknown": UNKNOWN, "aliked-n16": FREE}
+    files = {"free": FREE, "bound": BOUND, "unknown": UNKNOWN, **dict.fromkeys(OF_MODERN, FREE)}
     for name, content in files.items():
         (folder / f"{name}.pth").write_bytes(content)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
@@ -72,7 +73,8 @@ def registry_text(address: str) -> str:
 
     bound = entry("bound", BOUND, commercial="false")
     others = [entry(name, None) for name in ("unknown", "by-hand")]
-    return "".join([entry("free", FREE), bound, *others, entry("aliked-n16", FREE)])
+    of_modern = [entry(name, FREE) for name in OF_MODERN]
+    return "".join([entry("free", FREE), bound, *others, *of_modern])
 
 
 @pytest.fixture
@@ -96,8 +98,9 @@ def test_fetch_downloads_and_checks_files(megloc: Any, folder: Path) -> None:
 
 
 def test_fetch_downloads_the_files_of_a_preset(megloc: Any, folder: Path) -> None:
-    fetched = megloc("weights", "fetch", "--preset", "modern", "-q").out
-    assert fetched.startswith(f"aliked-n16: {folder}/aliked-n16.pth")
+    fetched = megloc("weights", "fetch", "--preset", "modern", "-q").out.splitlines()
+    places = [f"{name}: {folder}/{name}.pth" for name in OF_MODERN]
+    assert [line.partition(" (")[0] for line in fetched] == places
     again = megloc("weights", "fetch", "--preset", "modern").out
     assert again == "modern: no weights are missing\n"
     megloc("weights", "fetch", "--preset", "moden").refused("did you mean 'modern'")

@@ -264,8 +264,8 @@ def queries(workspace: Path, scene: Path) -> list[Query]:
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((10, 10, 3), np.uint8), r"is uint8 \(300, 400, 3\), got uint8 \(10, 10, 3\)"),
-        (np.zeros((300, 400, 3)), r"is uint8 \(300, 400, 3\), got float64"),
+        (np.zeros((10, 10, 3), np.uint8), r"image uint8 \(300, 400, 3\), got uint8 \(10, 10, 3\)"),
+        (np.zeros((300, 400, 3)), r"image uint8 \(300, 400, 3\), got float64"),
     ],
     ids=["size", "float"],
 )

@@ -358,9 +358,9 @@ def test_the_pairs_to_rematch_are_those_with_most_verified_matches() -> None:
     two, lone = (SecondMatchingOptions(pairs=pairs) for pairs in (2, 1))
     assert pairs_to_rematch(verified, two, of_both=False) == of_first
     assert pairs_to_rematch(verified, lone, of_both=True) == [("a", "b"), ("a", "c"), ("a", "d")]
-    # the weak pairs alone, but not a pair without matches
-    weak = SecondMatchingOptions(pairs=1, min_matches=9)
-    assert pairs_to_rematch(verified, weak, of_both=True) == [("a", "b"), ("a", "d"), ("b", "c")]
+    weak = SecondMatchingOptions(pairs=2, min_matches=9)
+    of_weak = [("a", "b"), ("a", "d"), ("b", "c"), ("c", "d")]
+    assert pairs_to_rematch(verified, weak, of_both=True) == of_weak
 
 
 @pytest.mark.parametrize(
