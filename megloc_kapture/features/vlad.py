@@ -64,24 +64,10 @@ class VladOptions(Options):
     )
 
 
-@dataclass(frozen=True, eq=False)
-class PcaWhitening:
-    """PCA whitening ``projection (x - mean)``, scaled to unit norm (Jegou and Chum, ECCV 2012)."""
-
-    mean: Float32
-    projection: Float32
-
-    def apply(self, vector: NDArray[np.floating[Any]]) -> Float32:
-        """Whiten one vector (D,) to float32 (d,) of unit norm; zero stays zero."""
-        if not np.any(vector):
-            return np.zeros(len(self.projection), dtype=np.float32)
-        whitened = self.projection @ (np.asarray(vector, dtype=np.float32) - self.mean)
-        norm = np.linalg.norm(whitened)
-        return whitened / norm if norm > 0 else whitened
-
-
-def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
-    """Learn whitening from vectors float32 (N, D), which are overwritten.
+def learn_whitening(
+    vectors: Float32, dimensions: int, power: float = 1.0
+) -> tuple[Float32, Float32]:
+    """Learn mean and projection of a whitening from vectors float32 (N, D), which are overwritten.
 
     Components are divided by their standard deviations raised to ``power``; a power below one
     reduces the noise of the last components if images are few (Revaud et al., ICCV 2019).
@@ -113,19 +99,37 @@ def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> Pc
     # fix the sign of each axis: its entry of largest magnitude is positive
     largest = np.take_along_axis(projection, np.abs(projection).argmax(axis=1)[:, None], axis=1)
     projection *= np.where(largest < 0, np.float32(-1), np.float32(1))
-    return PcaWhitening(mean, projection)
+    return mean, projection
 
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """Visual words float32 (V, K, D) of V vocabularies, and an optional whitening."""
+    """Visual words of one or more vocabularies, and an optional PCA whitening of their vectors.
+
+    Attributes
+    ----------
+    centres : float32 (V, K, D), the visual words of V vocabularies.
+    mean, projection : the whitening of a vector x is ``projection (x - mean)``, scaled to unit norm
+        (Jegou and Chum, ECCV 2012); None for both means no whitening.
+    """
 
     centres: Float32
-    whitening: PcaWhitening | None = None
+    mean: Float32 | None = None
+    projection: Float32 | None = None
 
     @property
     def size(self) -> int:
-        return self.centres.size if self.whitening is None else len(self.whitening.projection)
+        return self.centres.size if self.projection is None else len(self.projection)
+
+    def whiten(self, vector: Float32) -> Float32:
+        """Whiten one vector (V * K * D,), if there is a whitening; zero stays zero."""
+        if self.mean is None or self.projection is None:
+            return vector
+        if not vector.any():
+            return np.zeros(len(self.projection), dtype=np.float32)
+        whitened = self.projection @ (vector - self.mean)
+        norm = np.linalg.norm(whitened)
+        return whitened / norm if norm > 0 else whitened
 
 
 Each = Callable[[Callable[[str], Float32], Iterable[str]], Iterable[Float32]]
@@ -168,7 +172,7 @@ def train_vlad(
     for row, vector in zip(vectors, each(describe, described), strict=True):
         row[:] = vector
     whitening = learn_whitening(vectors, options.dimensions, WHITENING_POWER)
-    return Vocabulary(vocabulary.centres, whitening)
+    return Vocabulary(vocabulary.centres, *whitening)
 
 
 def _read_and_aggregate(
@@ -279,8 +283,7 @@ def aggregate(
     if len(data) == 0:
         return np.zeros(vocabulary.size, dtype=np.float32)
     blocks = [_aggregate_one(data, centres, options) for centres in vocabulary.centres]
-    vector = _unit(np.concatenate(blocks)).astype(np.float32)
-    return vector if vocabulary.whitening is None else vocabulary.whitening.apply(vector)
+    return vocabulary.whiten(_unit(np.concatenate(blocks)).astype(np.float32))
 
 
 def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDArray[np.float64]:

@@ -14,13 +14,7 @@ from pydantic import Field, ValidationError
 
 from megloc_kapture.errors import OptionError, PluginError, require, suggestion
 from megloc_kapture.features.image_bound import bounded_image
-from megloc_kapture.features.vlad import (
-    PcaWhitening,
-    VladOptions,
-    Vocabulary,
-    aggregate,
-    train_vlad,
-)
+from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate, train_vlad
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.features import has_features
@@ -140,9 +134,9 @@ def write_vocabulary(
 ) -> None:
     """Write ``vocabulary.npy``, the whitening and, last, ``vlad.json``."""
     write_array(folder / VOCABULARY_FILE, vocabulary.centres)
-    if vocabulary.whitening is not None:
-        write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
-        write_array(folder / PROJECTION_FILE, vocabulary.whitening.projection)
+    for name, array in ((MEAN_FILE, vocabulary.mean), (PROJECTION_FILE, vocabulary.projection)):
+        if array is not None:
+            write_array(folder / name, array)
     write_json_model(folder / SETTINGS_FILE, VladSettings(local_type=local_type, options=options))
 
 
@@ -155,7 +149,7 @@ def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
     if settings.options.dimensions is None:
         return Vocabulary(centres), settings
     mean, projection = (np.load(folder / name) for name in (MEAN_FILE, PROJECTION_FILE))
-    return Vocabulary(centres, PcaWhitening(mean, projection)), settings
+    return Vocabulary(centres, mean, projection), settings
 
 
 VLAD = "vlad"

@@ -171,21 +171,22 @@ def test_training_learns_vocabularies_then_whitening() -> None:
     plain = train_vocabulary(np.concatenate([images[name] for name in named]), WHITENED)
     np.testing.assert_array_equal(vocabulary.centres, plain.centres)
     vectors = np.stack([aggregate(images[name], plain, WHITENED) for name in named])
-    expected = learn_whitening(vectors.copy(), 10, 0.5)
-    assert vocabulary.whitening is not None and vocabulary.size == 10
-    np.testing.assert_array_equal(vocabulary.whitening.projection, expected.projection)
-    np.testing.assert_array_equal(vocabulary.whitening.mean, expected.mean)
+    mean, projection = learn_whitening(vectors.copy(), 10, 0.5)
+    assert vocabulary.size == 10
+    np.testing.assert_array_equal(vocabulary.projection, projection)
+    np.testing.assert_array_equal(vocabulary.mean, mean)
     whitened = aggregate(images[named[0]], vocabulary, WHITENED)
-    np.testing.assert_array_equal(whitened, expected.apply(vectors[0]))
+    expected = projection @ (vectors[0] - mean)
+    np.testing.assert_array_equal(whitened, expected / np.linalg.norm(expected))
     assert not aggregate(images["empty"], vocabulary, WHITENED).any()
     unwhitened = train(images, WHITENED.model_copy(update={"dimensions": None}))
-    assert unwhitened.whitening is None and unwhitened.size == 64
+    assert unwhitened.projection is None and unwhitened.size == 64
 
 
 @pytest.mark.parametrize(("count", "size"), [(2, 1), (30, 10)])
 def test_whitening_has_fewer_dimensions_than_images(count: int, size: int) -> None:
-    whitening = train(images_of(np.random.default_rng(14), count), WHITENED).whitening
-    assert whitening is not None and len(whitening.projection) == size
+    projection = train(images_of(np.random.default_rng(14), count), WHITENED).projection
+    assert projection is not None and len(projection) == size
 
 
 def test_whitening_is_learnt_from_a_bounded_number_of_images(
@@ -217,12 +218,12 @@ def test_the_projection_is_the_eigenvectors_over_powers_of_the_deviations(
     monkeypatch.setattr(vlad, "_COLUMNS", 4)  # dimensions are read in parts
     data = vectors_of(np.random.default_rng(1), count, size)
     variances, axes = scipy.linalg.eigh(np.cov(data.astype(np.float64).T, bias=True))
-    whitening = learn_whitening(data.copy(), 5, power)
-    mirrored = learn_whitening(-data, 5, power).projection
-    np.testing.assert_allclose(whitening.projection, mirrored, atol=1e-5)
-    np.testing.assert_allclose(whitening.mean, data.mean(axis=0), atol=1e-5)
-    assert whitening.projection.shape == (5, size)
-    for k, row in enumerate(whitening.projection, start=1):
+    mean, projection = learn_whitening(data.copy(), 5, power)
+    _, mirrored = learn_whitening(-data, 5, power)
+    np.testing.assert_allclose(projection, mirrored, atol=1e-5)
+    np.testing.assert_allclose(mean, data.mean(axis=0), atol=1e-5)
+    assert projection.shape == (5, size)
+    for k, row in enumerate(projection, start=1):
         expected = axes[:, -k] / np.sqrt(variances[-k]) ** power
         expected *= np.sign(expected[np.abs(expected).argmax()])
         np.testing.assert_allclose(row, expected, atol=5e-4)
@@ -230,13 +231,14 @@ def test_the_projection_is_the_eigenvectors_over_powers_of_the_deviations(
 
 def test_whitened_vectors_have_unit_length_and_zero_stays_zero() -> None:
     data = vectors_of(np.random.default_rng(6), 20, 10)
-    whitening = learn_whitening(data.copy(), 4)
-    result = whitening.apply(data[0])
+    mean, projection = learn_whitening(data.copy(), 4)
+    vocabulary = Vocabulary(np.zeros((1, 2, 5), np.float32), mean, projection)
+    result = vocabulary.whiten(data[0])
     assert result.dtype == np.float32 and result.shape == (4,)
     np.testing.assert_allclose(np.linalg.norm(result), 1.0, atol=1e-6)
-    assert not whitening.apply(np.zeros(10, np.float32)).any()
-    assert not whitening.apply(whitening.mean).any()
+    assert not vocabulary.whiten(np.zeros(10, np.float32)).any()
+    assert not vocabulary.whiten(mean).any()
     # dimensions without variance are left out
     rng = np.random.default_rng(7)
     flat = (rng.normal(size=(30, 3)) @ rng.normal(size=(3, 20))).astype(np.float32)
-    assert len(learn_whitening(flat, 20).projection) == 3
+    assert len(learn_whitening(flat, 20)[1]) == 3

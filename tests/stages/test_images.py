@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, PluginError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.features.vlad import PcaWhitening, VladOptions, Vocabulary, aggregate
+from megloc_kapture.features.vlad import VladOptions, Vocabulary, aggregate
 from megloc_kapture.io.images import (
     image_size,
     read_depth_map,
@@ -479,11 +479,10 @@ def test_a_stored_vocabulary_is_read_back(tmp_path: Path) -> None:
     mean, projection, centres = (
         rng.normal(size=size).astype(np.float32) for size in (30, (4, 30), (2, 3, 5))
     )
-    vocabulary = Vocabulary(centres, PcaWhitening(mean, projection))
+    vocabulary = Vocabulary(centres, mean, projection)
     write_vocabulary(tmp_path, vocabulary, "r2d2", VladOptions(vocabularies=2, dimensions=4))
     stored, settings = read_vocabulary(tmp_path) or pytest.fail("no vocabulary")
     assert (settings.local_type, settings.options.vocabularies) == ("r2d2", 2)
-    assert stored.whitening is not None
     np.testing.assert_array_equal(stored.centres, centres)
-    np.testing.assert_array_equal(stored.whitening.mean, mean)
-    np.testing.assert_array_equal(stored.whitening.projection, projection)
+    np.testing.assert_array_equal(stored.mean, mean)
+    np.testing.assert_array_equal(stored.projection, projection)
