@@ -121,41 +121,36 @@ def _activated(
     return nn.Sequential(layer, nn.BatchNorm2d(out), kind(inplace=True))
 
 
-class AtrousPyramid(nn.Module):
-    """Atrous spatial pyramid pooling: five branches, concatenated and projected.
+class Head(nn.Module):
+    """Classifier of low-level features and an atrous spatial pyramid, at 1/4 resolution.
 
-    The last branch is a global average, equal at all pixels.
+    The pyramid has five branches, which are concatenated and projected; the last is a global
+    average, equal at all pixels.
     """
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, low_level_channels: int, num_classes: int) -> None:
         super().__init__()
+        self.project = _activated(low_level_channels, _LOW_LEVEL_WIDTH, 1)
         branches = [_activated(channels, _WIDTH, 1)]
         branches += [
             _activated(channels, _WIDTH, 3, padding=rate, dilation=rate) for rate in _DILATIONS
         ]
         whole = nn.Sequential(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
-        self.convs = nn.ModuleList([*branches, whole])
-        self.project = _activated(len(self.convs) * _WIDTH, _WIDTH, 1)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        *local, whole = (branch(x) for branch in self.convs)
-        return self.project(torch.cat([*local, whole.expand_as(local[0])], dim=1))
-
-
-class Head(nn.Module):
-    """Classifier of pyramid and low-level features, at 1/4 resolution."""
-
-    def __init__(self, channels: int, low_level_channels: int, num_classes: int) -> None:
-        super().__init__()
-        self.project = _activated(low_level_channels, _LOW_LEVEL_WIDTH, 1)
-        self.aspp = AtrousPyramid(channels)
+        convs = nn.ModuleList([*branches, whole])
+        project = _activated(len(convs) * _WIDTH, _WIDTH, 1)
+        self.aspp = nn.ModuleDict({"convs": convs, "project": project})
         self.classifier = _activated(_LOW_LEVEL_WIDTH + _WIDTH, _WIDTH, 3, padding=1)
         self.classifier.append(nn.Conv2d(_WIDTH, num_classes, 1))
 
     def forward(self, low_level: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         fine = self.project(low_level)
+        *local, whole = (branch(features) for branch in self.aspp["convs"].children())
+        pyramid = torch.cat([*local, whole.expand_as(local[0])], dim=1)
         coarse = F.interpolate(
-            self.aspp(features), size=fine.shape[-2:], mode="bilinear", align_corners=False
+            self.aspp["project"](pyramid),
+            size=fine.shape[-2:],
+            mode="bilinear",
+            align_corners=False,
         )
         return self.classifier(torch.cat([fine, coarse], dim=1))
 
