@@ -96,19 +96,24 @@ def _perceptron(sizes: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers[:-2])
 
 
-class _Attention(nn.Module):
-    """Multi-head attention; channel c of a checkpoint belongs to head c mod 4."""
+class _Layer(nn.Module):
+    """Message passing by multi-head attention (equation 3).
+
+    Channel c of a checkpoint's attention belongs to head c mod 4.
+    """
 
     def __init__(self, size: int) -> None:
         super().__init__()
-        self.merge = _Pointwise(size, size)
-        self.proj = nn.ModuleList([_Pointwise(size, size) for _ in range(3)])
+        merge, proj = _Pointwise(size, size), [_Pointwise(size, size) for _ in range(3)]
+        self.attn = nn.ModuleDict({"merge": merge, "proj": nn.ModuleList(proj)})
+        self.mlp = _perceptron([2 * size, 2 * size, size])
 
     def forward(self, tokens: torch.Tensor, lengths: Sequence[int], *, cross: bool) -> torch.Tensor:
         size = tokens.shape[1]
         by_head = torch.arange(size, device=tokens.device).view(-1, _HEADS).T.flatten()
-        weight = torch.cat([part.get_parameter("weight")[by_head, :, 0] for part in self.proj])
-        bias = torch.cat([part.get_parameter("bias")[by_head] for part in self.proj])
+        merge, parts = self.attn["merge"], list(self.attn["proj"].children())
+        weight = torch.cat([part.get_parameter("weight")[by_head, :, 0] for part in parts])
+        bias = torch.cat([part.get_parameter("bias")[by_head] for part in parts])
         projected = functional.linear(tokens, weight, bias)
         images = [
             image.view(-1, 3, _HEADS, size // _HEADS).transpose(0, 2).unbind(1)
@@ -117,23 +122,10 @@ class _Attention(nn.Module):
         attended = []
         for index, (query, _, _) in enumerate(images):
             _, key, value = images[index ^ 1 if cross else index]
-            message = functional.scaled_dot_product_attention(query[None], key[None], value[None])
-            attended.append(message[0].transpose(0, 1).flatten(1))
-        return functional.linear(
-            torch.cat(attended), self.merge.weight[:, by_head, 0], self.merge.bias
-        )
-
-
-class _Layer(nn.Module):
-    """Message passing by attention (equation 3)."""
-
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.attn = _Attention(size)
-        self.mlp = _perceptron([2 * size, 2 * size, size])
-
-    def forward(self, tokens: torch.Tensor, lengths: Sequence[int], *, cross: bool) -> torch.Tensor:
-        message = self.attn(tokens, lengths, cross=cross)
+            read = functional.scaled_dot_product_attention(query[None], key[None], value[None])
+            attended.append(read[0].transpose(0, 1).flatten(1))
+        weight, bias = merge.get_parameter("weight")[:, by_head, 0], merge.get_parameter("bias")
+        message = functional.linear(torch.cat(attended), weight, bias)
         return self.mlp(torch.cat([tokens, message], dim=1))
 
 
