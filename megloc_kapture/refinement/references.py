@@ -8,8 +8,7 @@ detected.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +30,7 @@ from megloc_kapture.values import RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
 _MAX_ANGLE_DEG = 60.0  # between the viewing directions of a query and of its references
-# held-out images: largest and smallest number of displacements (five are all above the true median
-# with a chance of 1 in 32), and largest number of images tried
-MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
+MAX_TRIED = 96  # largest number of images that are held out
 # smallest ratio of baseline to surface distance: an angle of about 6 deg between views
 _MIN_PARALLAX = 0.1
 # candidate references: an upper bound of the overlap is computed for the nearest images, and the
@@ -113,14 +110,6 @@ def pyramid_of(view: PosedImage, options: RenderingOptions) -> list[Level]:
     )
 
 
-@dataclass(frozen=True)
-class Consistency:
-    images: int
-    contradicting: int
-    medians: dict[str, float]  # of each of DISPLACEMENT; NaN if no image was tested
-    reason: str  # why the map is inconsistent; empty if it is consistent
-
-
 def spread_names(names: Sequence[str]) -> list[str]:
     """Return at most ``MAX_TRIED`` names in van der Corput order: every prefix is spread evenly."""
     names = sorted(names)
@@ -134,34 +123,6 @@ def contradicts(displacement: Mapping[str, float]) -> bool:
         displacement["squared_distance"] > CHI2_OF_CHANCE
         and displacement["moved_px"] > _RESOLVED_PX
     )
-
-
-def judge_consistency(displacements: Iterable[Mapping[str, float] | None]) -> Consistency:
-    """Judge a map by at most ``MAX_TESTED`` displacements (DISPLACEMENT) of held-out images."""
-    known: list[Mapping[str, float]] = []
-    for each in displacements:
-        if each is not None:
-            known.append(each)
-            if len(known) == MAX_TESTED:
-                break
-    if not known:
-        reason = "no map image with depth overlaps with images from other viewpoints"
-        return Consistency(0, 0, dict.fromkeys(DISPLACEMENT, np.nan), reason)
-    medians = {name: float(np.median([each[name] for each in known])) for name in DISPLACEMENT}
-    contradicting = sum(map(contradicts, known))
-    reason = ""
-    if len(known) < MIN_TESTED:
-        reason = (
-            f"the map's consistency is unknown: {len(known)} of its images overlap with "
-            f"images from other viewpoints, at least {MIN_TESTED} are needed"
-        )
-    elif 2 * contradicting > len(known):
-        reason = (
-            f"the map contradicts itself: {contradicting} of {len(known)} held-out images would "
-            f"move by more than their uncertainty; the median motion is {medians['moved_m']:.3f} "
-            f"m, {medians['turned_deg']:.2f} deg, {medians['moved_px']:.1f} px"
-        )
-    return Consistency(len(known), contradicting, medians, reason)
 
 
 def references_elsewhere(

@@ -11,6 +11,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from megloc_kapture.errors import OptionError, PluginError
@@ -45,9 +46,9 @@ from megloc_kapture.plugins import (
     chosen_by_name,
 )
 from megloc_kapture.refinement.references import (
-    Consistency,
+    DISPLACEMENT,
     ReferenceImages,
-    judge_consistency,
+    contradicts,
     spread_names,
 )
 from megloc_kapture.stages.localized_folder import write_result_tables, write_timing
@@ -63,6 +64,9 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, Work, ordered_map
 from megloc_kapture.values import Camera, LocalizationResult, Options, Pose, RigidTransform
 
+# largest and smallest number of held-out map images (five displacements are all above the true
+# median with a chance of 1 in 32)
+MAX_TESTED, MIN_TESTED = 24, 5
 # map images held out in parallel; the test stops early, so a larger number wastes more work
 _WINDOW = 4
 # largest number of reference images of a pose: the nearest with a similar viewing direction
@@ -83,6 +87,37 @@ class PoseRefinementOptions(Options):
 
     def make_refiners(self, placement: Placement = AUTO) -> list[PoseRefiner]:
         return [load_chosen(POSE_REFINERS, chosen, placement) for chosen in self.by]
+
+
+def judge_consistency(
+    frame: str, method: str, displacements: Iterable[Mapping[str, float] | None]
+) -> ConsistencyRow:
+    """Judge a map by at most ``MAX_TESTED`` displacements (DISPLACEMENT) of held-out images."""
+    known: list[Mapping[str, float]] = []
+    for each in displacements:
+        if each is not None:
+            known.append(each)
+            if len(known) == MAX_TESTED:
+                break
+    if not known:
+        reason = "no map image with depth overlaps with images from other viewpoints"
+        unknown = dict.fromkeys(DISPLACEMENT, np.nan)
+        return ConsistencyRow(frame, method, 0, 0, **unknown, reason=reason)
+    medians = {name: float(np.median([each[name] for each in known])) for name in DISPLACEMENT}
+    contradicting = sum(map(contradicts, known))
+    reason = ""
+    if len(known) < MIN_TESTED:
+        reason = (
+            f"the map's consistency is unknown: {len(known)} of its images overlap with "
+            f"images from other viewpoints, at least {MIN_TESTED} are needed"
+        )
+    elif 2 * contradicting > len(known):
+        reason = (
+            f"the map contradicts itself: {contradicting} of {len(known)} held-out images would "
+            f"move by more than their uncertainty; the median motion is {medians['moved_m']:.3f} "
+            f"m, {medians['turned_deg']:.2f} deg, {medians['moved_px']:.1f} px"
+        )
+    return ConsistencyRow(frame, method, len(known), contradicting, **medians, reason=reason)
 
 
 class MapRefiners:
@@ -107,7 +142,7 @@ class MapRefiners:
             )
         self.refiners = tuple(options.make_refiners(placement))
         self.map, self._tables = mapping, tables
-        self._verdicts: dict[str, list[Consistency | None]] = {}
+        self._verdicts: dict[str, list[ConsistencyRow | None]] = {}
         self._lock = threading.Lock()
 
     @cached_property
@@ -125,29 +160,24 @@ class MapRefiners:
         with self._lock:
             for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
                 self._verdicts[frame] = [
-                    self._judge(refiner, self._by_frame[frame], work)
+                    self._judge(refiner, frame, work)
                     if getattr(refiner, "require_consistent_map", False)
                     else None
                     for refiner in self.refiners
                 ]
 
-    def _judge(self, refiner: Any, images: ReferenceImages, work: Work) -> Consistency:
+    def _judge(self, refiner: Any, frame: str, work: Work) -> ConsistencyRow:
+        images = self._by_frame[frame]
         hold_out, spread = partial(_hold_out, self.map, refiner, images), spread_names(images.names)
-        return judge_consistency(ordered_map(hold_out, spread, work.executor, window=_WINDOW))
+        displacements = ordered_map(hold_out, spread, work.executor, window=_WINDOW)
+        return judge_consistency(frame, refiner.name, displacements)
 
     def tested(self) -> list[ConsistencyRow]:
         """Return the rows of ``map_consistency.csv``."""
         return [
-            ConsistencyRow(
-                frame,
-                refiner.name,
-                verdict.images,
-                verdict.contradicting,
-                **verdict.medians,
-                reason=verdict.reason,
-            )
-            for number, refiner in enumerate(self.refiners)
-            for frame, verdicts in sorted(self._verdicts.items())
+            verdict
+            for number in range(len(self.refiners))
+            for _, verdicts in sorted(self._verdicts.items())
             if (verdict := verdicts[number]) is not None
         ]
 

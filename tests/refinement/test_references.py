@@ -16,22 +16,20 @@ from scenes import Scene
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.warping import PosedImage
+from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE, RenderingOptions
 from megloc_kapture.refinement.references import (
     DISPLACEMENT,
-    MAX_TESTED,
     MAX_TRIED,
-    MIN_TESTED,
-    Consistency,
     ReferenceImages,
     contradicts,
-    judge_consistency,
     pyramid_of,
     references_elsewhere,
     spread_names,
 )
 from megloc_kapture.refinement.rendering import Rendering
+from megloc_kapture.stages.pose_refinement import MAX_TESTED, MIN_TESTED, judge_consistency
 from megloc_kapture.values import Camera, RigidTransform
 
 HERE = RigidTransform.identity()
@@ -72,13 +70,12 @@ def scene_of(images: Map) -> Scene:
     )
 
 
-def verdict(images: Map) -> Consistency:
+def verdict(images: Map) -> ConsistencyRow:
     """Judge a map by its images."""
     rendering, scene = Rendering(QUICK), scene_of(images)
     poses = ReferenceImages(scene.poses)
-    return judge_consistency(
-        rendering.hold_out(name, poses, scene) for name in spread_names(list(images))
-    )
+    displacements = (rendering.hold_out(name, poses, scene) for name in spread_names(list(images)))
+    return judge_consistency("", "rendering", displacements)
 
 
 def changed(images: Map, change: Callable[[int, PosedImage], dict[str, Any]]) -> Map:
@@ -104,13 +101,13 @@ def test_an_image_must_fit_its_camera(corner: Map) -> None:
 def test_an_exact_map_is_consistent(corner: Map) -> None:
     exact = verdict(corner)
     assert not exact.reason and exact.images == len(POSES)
-    assert exact.medians["moved_m"] < 0.005 and exact.medians["turned_deg"] < 0.08
+    assert exact.moved_m < 0.005 and exact.turned_deg < 0.08
 
 
 def test_wrong_poses_contradict_each_other(corner: Map) -> None:
     result = verdict(posed(corner, lambda k, each: displaced(each, k, 0.02, 0.5)))
     assert "contradicts itself" in result.reason
-    assert result.medians["moved_m"] > 0.01 and result.medians["turned_deg"] > 0.25
+    assert result.moved_m > 0.01 and result.turned_deg > 0.25
 
 
 @SLOW
@@ -159,7 +156,7 @@ def test_images_without_parallax_or_depth_are_not_judged(corner: Map) -> None:
     # and without depth
     result = verdict(with_depth(corner, lambda view: {"depth_m": np.zeros_like(view.depth_m)}))
     assert (result.images, result.contradicting) == (0, 0) and "depth" in result.reason
-    assert np.isnan([result.medians[name] for name in DISPLACEMENT]).all()
+    assert np.isnan([getattr(result, name) for name in DISPLACEMENT]).all()
 
 
 def test_images_behind_a_wall_are_no_reference(corner: Map) -> None:
@@ -185,18 +182,18 @@ def known(squared_distance: float, moved_px: float = 0.5) -> dict[str, float]:
 @given(st.lists(st.booleans(), min_size=MIN_TESTED, max_size=MAX_TESTED))
 def test_most_of_the_images_decide(wrong: list[bool]) -> None:
     values = [CHI2_OF_CHANCE * (1.01 if each else 0.99) for each in wrong]
-    result = judge_consistency(map(known, values))
+    result = judge_consistency("", "rendering", map(known, values))
     assert (result.images, result.contradicting) == (len(wrong), sum(wrong))
     assert (not result.reason) == (sum(wrong) <= len(wrong) / 2)
-    assert result.medians["squared_distance"] == pytest.approx(np.median(values))
+    assert result.squared_distance == pytest.approx(np.median(values))
 
 
 def test_few_images_decide_nothing_and_many_are_not_used() -> None:
-    few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
+    few = judge_consistency("", "", [None, *[known(1.0)] * (MIN_TESTED - 1), None])
     assert "unknown" in few.reason and few.images == MIN_TESTED - 1
-    assert not judge_consistency([None, *[known(1.0)] * MIN_TESTED]).reason
+    assert not judge_consistency("", "", [None, *[known(1.0)] * MIN_TESTED]).reason
     asked = iter([known(1.0)] * 100)
-    assert judge_consistency(asked).images == MAX_TESTED
+    assert judge_consistency("", "", asked).images == MAX_TESTED
     assert len(list(asked)) == 100 - MAX_TESTED
     # displacements below the resolution of the alignment do not contradict
     assert contradicts(known(1e4, 0.06)) and not contradicts(known(1e4, 0.04))
