@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import sys
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
 from megloc_kapture.plugin_names import entry_points
@@ -22,28 +21,33 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Device and precision of networks whose options do not set them; part of a run's context."""
+class NetworkOptions(Options):
+    """Device and precision of networks: options of a plugin, or part of a run's context.
 
-    device: Device = "auto"
-    half_precision: bool = False
+    Those of a run apply to networks whose own options do not set them.
+    """
+
+    device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
+    half_precision: bool = Field(
+        default=False,
+        description="compute in float16 on a GPU, bfloat16 on a CPU, except for keypoint positions",
+    )
 
 
-AUTO = Placement()
+AUTO = NetworkOptions()
 
 
-def load_chosen(group: str, chosen: PluginChoice, placement: Placement = AUTO) -> Any:
+def load_chosen(group: str, chosen: PluginChoice, placement: NetworkOptions = AUTO) -> Any:
     return load_plugin(group, chosen.name, chosen.options, placement)
 
 
 def load_plugin(
-    group: str, name: str, options: dict[str, Any] | None = None, placement: Placement = AUTO
+    group: str, name: str, options: dict[str, Any] | None = None, placement: NetworkOptions = AUTO
 ) -> Any:
     """Make the plugin ``name`` of ``group``, with its options; PluginError if impossible."""
     kind = plugin_class(group, name)
     model: Any = getattr(kind, "Options", None)
-    wanted = {key: value for key, value in vars(placement).items() if value != getattr(AUTO, key)}
+    wanted = placement.model_dump(exclude_defaults=True)
     if model is not None:
         known = {key: value for key, value in wanted.items() if key in model.model_fields}
         options = {**known, **(options or {})}

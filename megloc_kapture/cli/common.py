@@ -26,7 +26,7 @@ from megloc_kapture.pipeline.executors import (
     open_executor,
     single_threaded,
 )
-from megloc_kapture.plugin_loading import AUTO, Placement
+from megloc_kapture.plugin_loading import AUTO, NetworkOptions
 from megloc_kapture.stages.stage import count_label
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
@@ -167,7 +167,7 @@ class Working(Common):
     scheduler: str | None = None
     """Address of a running dask scheduler (tcp://HOST:8786); if omitted, a local cluster."""
 
-    def placement(self) -> Placement:
+    def placement(self) -> NetworkOptions:
         return AUTO
 
     @contextmanager
@@ -245,13 +245,18 @@ class Computing:
     precision: Literal["full", "half"] | None = None
     """Precision of the networks; half: float16 on a GPU, bfloat16 on a CPU. If omitted, full."""
 
-    def placed(self) -> list[str]:
-        """Return device and precision in ``--set`` syntax."""
+    def assignments(self) -> tuple[str, ...]:
+        """Return the options that flags change, in ``--set`` syntax."""
         given = {"device": self.device, "precision": self.precision}
-        return [f"{name}={value}" for name, value in given.items() if value is not None]
+        return tuple(f"{name}={value}" for name, value in given.items() if value is not None)
 
-    def placement(self) -> Placement:
-        return Placement(self.device or "auto", self.precision == "half")
+    def placement(self) -> NetworkOptions:
+        from megloc_kapture.pipeline.presets import assigned, options_with  # slow import
+
+        chosen = assigned(self.assignments())
+        half = chosen.get("precision") == "half"
+        placed = {"device": chosen.get("device", "auto"), "half_precision": half}
+        return options_with(NetworkOptions, placed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,7 +269,7 @@ class Choosing(Computing):
     """Change an option: key.key=value; may be repeated."""
 
     def assignments(self) -> tuple[str, ...]:
-        return (*self.set, *self.placed())
+        return (*self.set, *super().assignments())
 
     def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
         """Return the preset's options with changes, those of ``--set`` last."""
@@ -272,12 +277,6 @@ class Choosing(Computing):
 
         preset = self.preset or DEFAULT_PRESET
         return options_of_preset(preset, changes=[changes or {}], assignments=self.assignments())
-
-    def placement(self) -> Placement:
-        from megloc_kapture.pipeline.presets import assigned  # slow import
-
-        chosen = assigned(self.assignments())
-        return Placement(chosen.get("device", "auto"), chosen.get("precision") == "half")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.warping import PosedImage, WarpedView, image_with_depth, warp_to_view
-from megloc_kapture.plugin_loading import Placement, load_chosen, weights_of
+from megloc_kapture.plugin_loading import NetworkOptions, load_chosen, weights_of
 from megloc_kapture.plugins import (
     IMAGE_DISTANCES,
     ImageDistance,
@@ -174,7 +174,9 @@ class PerceptualRanker:
 
     def __init__(self, options: PerceptualOptions | None = None) -> None:
         self.options = options or PerceptualOptions()
-        placement = Placement(self.options.device, self.options.half_precision)
+        placement = NetworkOptions(
+            device=self.options.device, half_precision=self.options.half_precision
+        )
         self._distance: ImageDistance = load_chosen(
             IMAGE_DISTANCES, self.options.distance, placement
         )

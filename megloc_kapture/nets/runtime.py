@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
 from torch import nn
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import reduced_size
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
+from megloc_kapture.plugin_loading import NetworkOptions as NetworkOptions
 from megloc_kapture.values import Device, Options
 
 _log = logging.getLogger(__name__)
@@ -28,14 +28,6 @@ _gpu_lock = RLock()
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 Net = TypeVar("Net", bound=nn.Module)
 _loading_lock = Lock()
-
-
-class NetworkOptions(Options):
-    device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
-    half_precision: bool = Field(
-        default=False,
-        description="compute in float16 on a GPU, bfloat16 on a CPU, except for keypoint positions",
-    )
 
 
 @cache

@@ -20,7 +20,7 @@ from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolde
 from megloc_kapture.io.kapture.features import has_features
 from megloc_kapture.plugin_loading import (
     AUTO,
-    Placement,
+    NetworkOptions,
     checked_array,
     load_chosen,
     option_fault,
@@ -172,7 +172,7 @@ class GlobalFeaturesChoice(PluginChoice):
             fault = option_fault(error, VladOptions)
             raise OptionError(f"global features {VLAD!r} reject their options: {fault}") from error
 
-    def make(self, placement: Placement = AUTO) -> GlobalFeatureExtractor:
+    def make(self, placement: NetworkOptions = AUTO) -> GlobalFeatureExtractor:
         known = plugin_names(PLUGINS)
         if self.name not in known:
             raise OptionError(

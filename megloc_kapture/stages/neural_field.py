@@ -34,8 +34,8 @@ from megloc_kapture.io.weights import WeightsFile, describe, read_weights, sha25
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.mapping.depth import sample_depth
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
-from megloc_kapture.nets.runtime import NetworkOptions, load_strictly, pick_device
-from megloc_kapture.plugin_loading import Placement, load_chosen, weights_of
+from megloc_kapture.nets.runtime import load_strictly, pick_device
+from megloc_kapture.plugin_loading import NetworkOptions, load_chosen, weights_of
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -300,7 +300,9 @@ class FieldRefiner:
             "the pose refiner field needs a field that megloc train-field wrote: --set "
             '\'pose_refinement.by=[{name="field",options={field="FOLDER"}}]\'',
         )
-        placement = Placement(self.options.device, self.options.half_precision)
+        placement = NetworkOptions(
+            device=self.options.device, half_precision=self.options.half_precision
+        )
         self._features: LocalFeatureExtractor = load_chosen(
             LOCAL_FEATURES, self.options.features, placement
         )

@@ -12,7 +12,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
-from megloc_kapture.plugin_loading import Placement, load_chosen
+from megloc_kapture.plugin_loading import NetworkOptions, load_chosen
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -103,8 +103,8 @@ class PipelineOptions(Options):
     )
 
     @property
-    def placement(self) -> Placement:
-        return Placement(self.device, self.precision == "half")
+    def placement(self) -> NetworkOptions:
+        return NetworkOptions(device=self.device, half_precision=self.precision == "half")
 
     def make_extractors(self) -> list[LocalFeatureExtractor]:
         return [

@@ -36,7 +36,7 @@ from megloc_kapture.io.tables import (
     read_status,
     write_consistency,
 )
-from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
+from megloc_kapture.plugin_loading import AUTO, NetworkOptions, load_chosen
 from megloc_kapture.plugins import (
     POSE_REFINERS,
     PluginChoice,
@@ -85,7 +85,7 @@ class PoseRefinementOptions(Options):
     def refines(self) -> bool:
         return bool(self.by)
 
-    def make_refiners(self, placement: Placement = AUTO) -> list[PoseRefiner]:
+    def make_refiners(self, placement: NetworkOptions = AUTO) -> list[PoseRefiner]:
         return [load_chosen(POSE_REFINERS, chosen, placement) for chosen in self.by]
 
 
@@ -132,7 +132,7 @@ class MapRefiners:
         mapping: KaptureFolder,
         tables: SideTables,
         options: PoseRefinementOptions,
-        placement: Placement = AUTO,
+        placement: NetworkOptions = AUTO,
     ) -> None:
         if options.refines() and unit_of(mapping.root) != METRES:
             raise OptionError(

@@ -22,7 +22,7 @@ from megloc_kapture.errors import DataError, OptionError, OutputError, PluginErr
 from megloc_kapture.io.files import link_file, link_records, write_json
 from megloc_kapture.io.images import image_as_read_back, image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.plugin_loading import Placement, checked_array, load_chosen
+from megloc_kapture.plugin_loading import NetworkOptions, checked_array, load_chosen
 from megloc_kapture.plugins import SEGMENTERS, PluginChoice, Segmenter
 from megloc_kapture.preprocessing.frames import (
     FramePlan,
@@ -76,7 +76,7 @@ class MaskOptions(Options):
         default=None, description="folder of masks IMAGE.png, 0 for ignored pixels"
     )
 
-    def make_classes(self, placement: Placement) -> ClassMasks | None:
+    def make_classes(self, placement: NetworkOptions) -> ClassMasks | None:
         if self.segmenter is None:
             return None
         segmenter: Segmenter = load_chosen(SEGMENTERS, self.segmenter, placement)

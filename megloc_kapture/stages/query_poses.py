@@ -37,7 +37,7 @@ from megloc_kapture.localization.cluster_poses import (
 )
 from megloc_kapture.localization.map_index import PoseProblem, QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
+from megloc_kapture.plugin_loading import AUTO, NetworkOptions, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
 from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.matches import candidates_of
@@ -98,7 +98,7 @@ class LocalizationOptions(Options):
         "from another camera of the rig; none: no pose",
     )
 
-    def make_ranker(self, placement: Placement = AUTO) -> PoseRanker:
+    def make_ranker(self, placement: NetworkOptions = AUTO) -> PoseRanker:
         ranker: PoseRanker = load_chosen(POSE_RANKERS, self.rank, placement)
         return ranker
 

@@ -21,7 +21,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import (
     AUTO,
-    Placement,
+    NetworkOptions,
     code_of,
     has_precision,
     is_ours,
@@ -131,7 +131,7 @@ class Stage(ABC):
     """
 
     root: Path | None = None
-    placement: Placement = AUTO
+    placement: NetworkOptions = AUTO
     name: str
     version: ClassVar[int] = 1
     resumes: ClassVar[bool] = False

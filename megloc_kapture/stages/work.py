@@ -18,7 +18,7 @@ from itertools import chain, groupby, islice
 from typing import Any, Generic, TypeVar
 
 from megloc_kapture.errors import MeglocError, PluginError
-from megloc_kapture.plugin_loading import AUTO, Placement
+from megloc_kapture.plugin_loading import AUTO, NetworkOptions
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -204,7 +204,7 @@ class Work:
     num_threads: int = 1
     resume: bool = False
     force: bool = False
-    placement: Placement = AUTO
+    placement: NetworkOptions = AUTO
 
     def map(
         self,

@@ -29,7 +29,7 @@ from megloc_kapture.pipeline.evaluation_plan import PIPELINE
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.plugin_loading import Placement, load_plugin
+from megloc_kapture.plugin_loading import NetworkOptions, load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, POSE_RANKERS
 from megloc_kapture.stages import work as devices
 from megloc_kapture.stages.local_features import (
@@ -209,7 +209,7 @@ def test_one_thread_uses_the_gpu(
 
 
 def test_networks_without_a_device_use_that_of_the_run() -> None:
-    placement = Placement("cuda:1", half_precision=True)
+    placement = NetworkOptions(device="cuda:1", half_precision=True)
     plain = load_plugin(MATCHERS, "nn", {"max_ratio": 0.9}, placement)  # without these options
     assert plain.options.max_ratio == 0.9
     ranking = {"distance": {"name": "structure"}, "device": "cpu"}
@@ -258,7 +258,7 @@ def test_out_of_memory_is_recognised(message: str, expected: bool) -> None:
 def test_a_localizer_takes_device_and_precision(world: Any) -> None:
     opened = KaptureMap.open(world.root / "map", features_dirs=[world.features_dir])
     placed = Localizer(opened, preset="modern", device="cpu", precision="half").options
-    assert placed.placement == Placement("cpu", half_precision=True)
+    assert placed.placement == NetworkOptions(device="cpu", half_precision=True)
     options = options_of_preset("classic", assignments={"device": "cpu"})
     with pytest.raises(OptionError, match="give the device and the precision in the options"):
         Localizer(opened, options=options, device="cuda")
