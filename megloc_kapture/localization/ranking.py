@@ -8,9 +8,9 @@ the cluster's map images with depth.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from itertools import islice
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -108,6 +108,7 @@ def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+_Compared = tuple[NDArray[np.uint8], WarpedView]
 
 _ANOTHER_VIEW = 0.2  # views that differ by less are near duplicates, see _nearest_first
 
@@ -153,12 +154,6 @@ class PerceptualOptions(Options):
     )
 
 
-class _Compared(NamedTuple):
-    query: NDArray[np.uint8]
-    aligned: NDArray[np.uint8]
-    valid: Mask
-
-
 class PerceptualRanker:
     """Plugin ``perceptual``: smallest image distance of the query to the view warped to its pose.
 
@@ -200,7 +195,7 @@ class PerceptualRanker:
         ]
         distances = np.array(
             [
-                np.inf if v is None else self._mean_distance(v, [a.valid for a in v])
+                np.inf if v is None else self._mean_distance(v, [warped.valid for _, warped in v])
                 for v in compared
             ]
         )
@@ -226,6 +221,7 @@ class PerceptualRanker:
         query_image: Callable[[str], NDArray[np.uint8]],
         source_of: Callable[[str], PosedImage | None],
     ) -> list[_Compared]:
+        """Return the query image and the map warped into it, at reduced size, for each view."""
         views, options, images = [], self.options, hypothesis.images
         for view in hypothesis.views:
             place = view.camera, view.cam_from_world
@@ -235,7 +231,7 @@ class PerceptualRanker:
             if mask is not None:
                 valid = valid & _mask_at_size(mask, width, height)
             query = query_at_size(query_image(view.name), width, height)
-            views.append(_Compared(query, warped.image, valid))
+            views.append((query, replace(warped, valid=valid)))
         return views
 
     def _against_each_other(
@@ -250,7 +246,7 @@ class PerceptualRanker:
             for j, second in enumerate(finalists[:i]):
                 if first is None or second is None:
                     continue
-                both = [a.valid & b.valid for a, b in zip(first, second, strict=True)]
+                both = [a.valid & b.valid for (_, a), (_, b) in zip(first, second, strict=True)]
                 margin = self._mean_distance(second, both) - self._mean_distance(first, both)
                 if not np.isfinite(margin):  # too few pixels are valid in both
                     margin = distances[at[j]] - distances[at[i]]
@@ -264,8 +260,8 @@ class PerceptualRanker:
         if counts.sum() < max(1.0, self.options.min_valid * sum(each.size for each in valid)):
             return float("inf")
         distances = [
-            self._distance.distance(view.query, view.aligned, mask) if count else np.inf
-            for view, mask, count in zip(views, valid, counts, strict=True)
+            self._distance.distance(query, warped.image, mask) if count else np.inf
+            for (query, warped), mask, count in zip(views, valid, counts, strict=True)
         ]
         known = np.isfinite(distances)
         if not known.any():
