@@ -170,6 +170,8 @@ def test_device_and_precision_of_networks_are_chosen_by_flags(
     assert full != half
     run = ["eval", "kapture", "--root", scene, "-w", tmp_path / "run", "-q", "--dry-run"]
     megloc(*run, "--preset", "modern", "--device", "gpu").refused("option device: String should")
+    alone = ("preprocess", "-i", scene / "query", "-o", tmp_path / "new", "--device", "gpu")
+    megloc(*alone).refused("option device: String should")
 
 
 @pytest.fixture
