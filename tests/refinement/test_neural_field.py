@@ -149,7 +149,7 @@ def test_resumed_training_equals_uninterrupted_training(monkeypatch: pytest.Monk
     assert all(torch.equal(expected[n], v) for n, v in resumed.module.state_dict().items())
     with pytest.raises(DataError, match=r"state\.pt: .* -f starts over"):
         FieldTrainer(views(4), QUICK).resume(states[0], path)
-    with pytest.raises(DataError, match=r"state\.pt: is damaged, or the state"):
+    with pytest.raises(DataError, match=r"state\.pt: is damaged or from"):
         trainer.resume(states[0][:-100], path)
 
 
