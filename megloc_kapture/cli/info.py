@@ -243,12 +243,21 @@ def shown(value: Any) -> str:
     if isinstance(value, PluginChoice) and not value.options:
         return value.name
     if isinstance(value, Options):
-        return json.dumps(value.model_dump(mode="json", exclude_defaults=True))
+        return _inline(value.model_dump(mode="json", exclude_defaults=True))
     if isinstance(value, tuple | list):
         return f"[{', '.join(shown(item) for item in value)}]"
     if value is None or isinstance(value, bool):
         return str(value).lower()
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _inline(value: Any) -> str:
+    """Format as an inline value of TOML, which is JSON but for tables."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {_inline(item)}' for key, item in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    return json.dumps(value)
 
 
 def _type_name(annotation: Any) -> str:

@@ -62,7 +62,7 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         ("sensors/records_camera.txt", "1, cam", "expected 3 columns, got 2"),
         ("sensors/records_camera.txt", "9.5, cam, a.jpg", "timestamp '9.5' is not an integer"),
         ("sensors/records_camera.txt", "9, cam, d\\a.jpg", "backslash .*; separate folders by /"),
-        ("sensors/records_camera.txt", "9, nocam, a.jpg", "unknown sensor or rig 'nocam': list"),
+        ("sensors/records_camera.txt", "9, nocam, a.jpg", "unknown sensor or rig 'nocam': define"),
         ("sensors/records_camera.txt", "9, deep, a.jpg", "of type 'depth', not 'camera'"),
         ("sensors/records_camera.txt", "0, cam, b.jpg", "timestamp 0 of 'cam' is listed twice"),
         ("sensors/records_camera.txt", "9, cam, ok.jpg", "'ok.jpg' is listed twice"),
