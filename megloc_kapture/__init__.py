@@ -18,7 +18,7 @@ from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputErr
 
 if sys.platform == "win32":
     raise ImportError(
-        "megloc-kapture needs file locks and fork servers, which Windows does not have; on Windows "
+        "megloc-kapture needs fcntl and fork servers, which Windows does not have; on Windows "
         "it runs under WSL 2"
     )
 

@@ -37,6 +37,7 @@ from megloc_kapture.pipeline.presets import (
 from megloc_kapture.plugin_loading import load_plugin, plugin_class, plugin_names
 from megloc_kapture.plugins import (
     DATASETS,
+    DEPTH_ESTIMATORS,
     GLOBAL_FEATURES,
     LOCAL_FEATURES,
     MATCHERS,
@@ -218,9 +219,9 @@ class OptionsCommand(Common):
 
     def run(self) -> None:
         every = list(options_of(options_of_preset(self.preset)))
-        if self.basic:
-            every = [option for option in every if option[0] in BASIC_OPTIONS]
         selected = [option for option in every if _is_below(option[0], self.key)]
+        if self.basic:
+            selected = [option for option in selected if option[0] in BASIC_OPTIONS] or selected
         if not selected:
             selected = list(_options_of_plugins(self.key))
         if not selected:
@@ -275,7 +276,7 @@ def _plugins() -> dict[str, list[str]]:
     groups_of: dict[str, list[str]] = {VLAD: []}
     for group in (
         *(LOCAL_FEATURES, GLOBAL_FEATURES, MATCHERS, POSE_RANKERS, POSE_REFINERS),
-        *(SEGMENTERS, DATASETS),
+        *(SEGMENTERS, DEPTH_ESTIMATORS, DATASETS),
     ):
         for name in plugin_names(group):
             groups_of.setdefault(name, []).append(group)

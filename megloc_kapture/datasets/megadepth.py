@@ -32,7 +32,7 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 _DEPTHS = ("phoenix/S6/zl548/MegaDepth_v1/{}/dense0/depths", "depth_undistorted/{}")
 _UNDISTORTED, _SCENE_INFO = "Undistorted_SfM", "scene_info"
-_MODELS = ("sparse", "sparse-txt", "sparse/0")
+_MODELS = ("sparse/0", "sparse", "sparse-txt")
 _ARRAYS = ("image_paths", "intrinsics", "poses")
 _IDENTITY = RigidTransform.identity()
 

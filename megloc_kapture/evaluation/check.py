@@ -29,8 +29,8 @@ from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
-# error: the server would reject the file or give wrong results for it; warning: some poses are
-# probably wrong or missing; note: for information
+# error: the server would reject the file or give wrong results for it; warning: probably a
+# mistake in the file; note: for information
 Severity = Literal["error", "warning", "note"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 # largest number of printed findings of one kind; the JSON lists all
@@ -299,7 +299,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
                 continue
             likely = alike or candidates
             if len(likely) != 1:
-                message = f"{name} is not in the list"
+                message = f"{name} is no known query"
                 findings.append(Finding("error", "unknown", message, line=line, names=(name,)))
                 continue
             right = wrong[name] = likely[0]

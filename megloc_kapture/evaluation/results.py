@@ -194,7 +194,7 @@ def read_result(
 
 
 def read_poses(source: Path) -> dict[str, RigidTransform]:
-    """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file."""
+    """Read ``cam_from_world`` by image from a kapture folder, COLMAP model or pose file."""
     require(source.exists(), "no such file or folder", path=source)
     if source.name == "images.bin":
         source = source.parent
@@ -239,7 +239,7 @@ def result_in_memory(
             continue
         require(
             isinstance(pose, Pose | Failure),
-            f"{image!r}: a {type(pose).__name__} is no pose; use RigidTransform.from_matrix(R, t)",
+            f"{image!r}: {type(pose).__name__} is not a pose; use RigidTransform.from_matrix(R, t)",
         )
         statuses[image] = pose
         if isinstance(pose, Pose):

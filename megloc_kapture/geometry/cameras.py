@@ -80,7 +80,7 @@ def with_two_focals(camera: Camera) -> Camera:
 
 
 def same_lens(first: Camera, second: Camera) -> bool:
-    """Return True if two cameras have the same distortion; all else may differ."""
+    """Return True for equal distortion models and parameters; all else may differ."""
     a, b = with_two_focals(first), with_two_focals(second)
     return a.model == b.model and a.params[4:] == b.params[4:]
 

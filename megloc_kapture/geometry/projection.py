@@ -206,8 +206,8 @@ def draw_depth_surface(
     """Render a depth map as a surface of small triangles into another view's depth buffer.
 
     The triangles join neighbouring pixels and leave no holes at any zoom; jumps in depth cut the
-    surface. Inverse depth is interpolated because it is linear in the pixels of an undistorted
-    plane. Returns depth (H, W), infinite without a surface, and a mask (H, W) of front faces.
+    surface. Inverse depth is interpolated: for a plane it is linear in undistorted pixels.
+    Returns depth (H, W), infinite without a surface, and a mask (H, W) of front faces.
 
     Parameters
     ----------

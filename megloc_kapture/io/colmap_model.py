@@ -126,7 +126,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     """Read the model of a folder; without points, their file need not exist."""
     paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
-        remedy = "; make an empty one for a model of poses only" if path.stem == "points3D" else ""
+        remedy = "; an empty file is a model of poses only" if path.name == "points3D.txt" else ""
         require(path.is_file(), f"file is missing{remedy}", path=path)
         if path.name in _RECORDS:
             _check_complete(path)
@@ -191,7 +191,7 @@ def _is_image(line: str) -> bool:
 def _images_for_pycolmap(path: Path, cameras: Path) -> tuple[str, dict[int, str]]:
     """Check ``images.txt``; return it with ids in place of names, and the names by id.
 
-    pycolmap ends names at a blank, and takes an image for features if the line before is missing.
+    pycolmap ends names at a blank, and after a missing line of features takes an image for one.
     """
     cameras_text = read_text(cameras).split("\n")
     camera_ids = {line.split(maxsplit=1)[0] for line in cameras_text if line.strip()}

@@ -51,7 +51,7 @@ class DistinctiveInliersOptions(Options):
         "of the image's longer side",
     )
     power: float = Field(
-        default=4.0, gt=0, description="exponent of the sharing; 1 shares an inlier evenly"
+        default=4.0, gt=0, description="an inlier of n hypotheses counts 1 / n ** power"
     )
 
 
@@ -60,8 +60,8 @@ class DistinctiveInliers:
 
     Similar rooms all explain the query's walls and furniture. An inlier has the weight ``1 / n **
     power``, with ``n`` the number of hypotheses that have an inlier within a radius (after the
-    geometric bursts of Sattler et al., CVPR 2016). Hypotheses that explain each other's inliers do
-    not compete.
+    geometric bursts of Sattler et al., CVPR 2016). One that explains another's inliers does not
+    compete.
     """
 
     Options = DistinctiveInliersOptions
@@ -161,7 +161,7 @@ class PerceptualRanker:
     smallest distances, the finalists, are compared pairwise over the pixels valid in both, since
     distances over different image parts are not comparable; a finalist's score is its mean margin.
     The remaining clusters follow by their distance, then those without depth or with few inliers.
-    If the cluster that ``distinctive`` ranks first has no valid view, the scores of ``distinctive``
+    If the cluster that ``distinctive`` ranks first is not compared, the scores of ``distinctive``
     are returned.
     """
 

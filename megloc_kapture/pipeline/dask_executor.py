@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -26,6 +26,19 @@ _CONNECT_S = 10.0
 _ALLOWED_FAILURES = 10
 _ITEMS_PER_WORKER = 4
 _PACKAGES = ["megloc_kapture", "numpy", "torch"]
+
+
+def _check_versions(versions: Mapping[str, Any]) -> None:
+    """Raise MeglocError if a worker has a package in another version than this process."""
+    here = versions["client"]["packages"]
+    for address, worker in versions["workers"].items():
+        there = worker["packages"]
+        for name in _PACKAGES:
+            if there[name] not in (here[name], None):  # work fails if a package is missing
+                raise MeglocError(
+                    f"package versions differ on the cluster: worker {address} has {name} "
+                    f"{there[name]}, here it is {here[name]}"
+                )
 
 
 @contextmanager
@@ -46,10 +59,8 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
         client = _client(stack, workers, scheduler)
         threads = sum(client.nthreads().values())
         check_option(threads, f"the scheduler {scheduler} has no workers: start some (dask worker)")
-        try:
-            client.get_versions(check=True, packages=_PACKAGES)
-        except ValueError as error:
-            raise MeglocError(f"the cluster has other versions of packages: {error}") from error
+        versions: Any = client.get_versions(packages=_PACKAGES)
+        _check_versions(versions)
         try:
             shared.mkdir(parents=True, exist_ok=True)
             client.register_plugin(_Preparation(Path.cwd(), shared.absolute()))

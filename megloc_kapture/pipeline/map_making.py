@@ -105,7 +105,7 @@ class ImportMapping(Stage):
 
     name = "import"
     version = 3
-    writes = (MAPPING, QUERY, SIDE_TABLES)  # later stages read QUERY, which stays missing
+    writes = (MAPPING, QUERY, SIDE_TABLES)  # QUERY is declared for later stages, never written
 
     def __init__(self, mapping: KaptureFolder) -> None:
         super().__init__(Options())
@@ -127,7 +127,7 @@ class ImportPhotographs(Stage):
     """Import photographs: upright images with cameras from EXIF (unless given), and no poses."""
 
     name = "import"
-    writes = (MAPPING, QUERY, SIDE_TABLES)  # later stages read QUERY, which stays missing
+    writes = (MAPPING, QUERY, SIDE_TABLES)  # QUERY is declared for later stages, never written
 
     def __init__(self, photographs: Photographs) -> None:
         super().__init__(Options())
@@ -234,7 +234,7 @@ def plan_photographs(
     stages: list[Stage] = [ImportPhotographs(photographs)]
     stages += wanted_stages((*_WITHOUT_POSES, MatchPhotographs), options)
     stages.append(FindPoses(options, structure))
-    with_poses = wanted_stages(_WITH_POSES, options)
+    with_poses = wanted_stages((*_WITH_POSES, Densify), options)
     for stage in with_poses:
         stage.posed = True
     return [*stages, *with_poses]

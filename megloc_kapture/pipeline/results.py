@@ -30,7 +30,7 @@ Candidates = Mapping[str, Sequence[str]]
 
 
 class Results(Mapping[str, Pose | Failure]):
-    """Mapping from image name to result, sorted by name; images of a rig may stay together.
+    """Mapping from image name to result, sorted by name, but rig images may be adjacent.
 
     Access to an image localizes it and all images before it. Photographs share cameras, so the
     first access localizes all of them. Results are cached; an unusable image gives a Failure.

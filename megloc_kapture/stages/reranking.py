@@ -58,7 +58,10 @@ class RerankingOptions(Options):
             return list(local_types)
         # in a type's name, the name of the weights may follow that of the plugin
         types = [local_type for local_type in local_types if base_type(local_type) == name]
-        return types or [local_type for local_type in local_types if local_type.startswith(name)]
+        followed = f"{name}-", f"{name}_"
+        return types or [
+            local_type for local_type in local_types if local_type.startswith(followed)
+        ]
 
     def counted_types(self, local_types: Sequence[str]) -> list[str]:
         types = self.types_named(local_types)

@@ -130,6 +130,8 @@ def test_options_are_listed_by_stage_key_and_plugin(megloc: Any) -> None:
     assert megloc("options", "query_pairs.top_k").out.count("\n") == 2
     assert "aliked: options.threshold = 0.2\n" in megloc("options", "aliked").out
     assert "vlad: options." in megloc("options", "vlad").out
+    assert "sweep: options." in megloc("options", "sweep").out
+    assert megloc("options", "mvs.estimator", "--basic").out.startswith("mvs.estimator = ")
 
 
 def test_the_version(megloc: Any) -> None:

@@ -241,7 +241,7 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
     (tmp_path / "poses.txt").write_text(format_pose_file({"other.jpg": RigidTransform.identity()}))
     with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
         evaluate(tmp_path / "poses.txt", truth)
-    with pytest.raises(DataError, match=r"'a.jpg': a ndarray is no pose; use RigidTransform"):
+    with pytest.raises(DataError, match=r"'a.jpg': ndarray is not a pose; use RigidTransform"):
         evaluate({"a.jpg": np.eye(4)}, truth)  # type: ignore[dict-item]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 from threadpoolctl import threadpool_info
 
 from megloc_kapture.errors import MeglocError, OptionError
@@ -113,6 +113,23 @@ def test_relative_paths_refer_to_the_folder_of_the_run(
     with open_executor("dask", scheduler=cluster, shared=Path("out")) as executor:
         assert list(ordered_map(_read, [Path("here.txt")] * 3, executor)) == ["seen"] * 3
     assert list(Path("out").iterdir()) == []
+
+
+def test_workers_with_another_version_of_a_package_are_refused(
+    cluster: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def changed(client: Client, **kwargs: Any) -> Any:
+        found = versions_of(client, **kwargs)
+        found["client"]["packages"]["numpy"] = "1.0"
+        return found
+
+    versions_of = Client.get_versions
+    monkeypatch.setattr(Client, "get_versions", changed)
+    with (
+        pytest.raises(MeglocError, match=r"worker tcp://.* has numpy .*, here it is 1\.0"),
+        open_executor("dask", scheduler=cluster),
+    ):
+        pass
 
 
 def test_folders_that_workers_cannot_read_are_refused(

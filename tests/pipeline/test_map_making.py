@@ -31,7 +31,9 @@ from megloc_kapture.pipeline.map_making import (
     describe_map,
     kapture_of,
     options_of_photographs,
+    plan_photographs,
 )
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.values import Camera, RigidTransform
 from tests.rendering import corner
@@ -278,6 +280,13 @@ def test_options_that_need_poses_are_refused(
     with pytest.raises((OptionError, DataError), match=message):
         megloc.map_photographs(room / "photos", workspace=tmp_path / "map", **arguments)
     assert not (tmp_path / "map").exists()
+
+
+def test_a_map_of_photographs_can_be_densified(room: Path, tmp_path: Path) -> None:
+    photographs = Photographs([put(tmp_path / "photos", images_of(room)[:4])])
+    options = options_of_preset(assignments=["mvs.mode=points"])
+    stages = plan_photographs(photographs, options, mapper="incremental")
+    assert any("map" in stage.writes for stage in stages)
 
 
 def test_presets_for_photographs_need_no_poses() -> None:

@@ -256,10 +256,11 @@ def test_one_local_type_can_be_chosen_for_reranking(tmp_path: Path) -> None:
     for name, image in first.items():
         options = RerankingOptions(by="verified", local_type=name)
         assert reranked(PAIRS, query, tmp_path, types, options)[0].map == image
-    unknown = RerankingOptions(by="verified", local_type="superpint")
-    message = r"reranking\.local_type: no local features of type 'superpint'; did you mean"
-    with pytest.raises(OptionError, match=message):
-        reranked(PAIRS, query, tmp_path, types, unknown)
+    for name in ("superpint", "super"):
+        unknown = RerankingOptions(by="verified", local_type=name)
+        message = rf"reranking\.local_type: no local features of type '{name}'; "
+        with pytest.raises(OptionError, match=message):
+            reranked(PAIRS, query, tmp_path, types, unknown)
 
 
 def test_coverage_counts_each_keypoint_once(tmp_path: Path) -> None:

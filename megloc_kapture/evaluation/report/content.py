@@ -222,8 +222,8 @@ def method_sentence(comparison: Comparison) -> str:
     number = len(comparison.tests)
     holm = f", after Holm's correction for {number} tests" if number > 1 else ""
     return (
-        "Exact McNemar test on the same queries, assumed independent, two-sided; real: p at or "
-        f"below {SIGNIFICANCE:g}{holm}. Intervals of medians: {NUM_RESAMPLES} resamples of the "
+        'Exact McNemar test on the same queries, assumed independent, two-sided; "real": p at '
+        f"or below {SIGNIFICANCE:g}{holm}. Intervals of medians: {NUM_RESAMPLES} resamples of the "
         "queries."
     )
 

@@ -114,7 +114,7 @@ def read_observations(path: Path) -> dict[str, Observations]:
             raise DataError("not a text file in UTF-8") from error
         except (ValueError, OverflowError) as error:
             message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, with ids of 0 or more"
-            remedy = "upgrade kapture 1.0, which has no type, with kapture_upgrade_1_0_to_1_1"
+            remedy = "files of kapture 1.0 have no type: run kapture_upgrade_1_0_to_1_1"
             raise DataError(f"{message}; {remedy}") from error
     if not blocks:
         return {}
