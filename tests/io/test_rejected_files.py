@@ -167,7 +167,7 @@ def test_wrong_points_are_named(tmp_path: Path, row: str, message: str) -> None:
     [
         ("5, t, a, 1, b", "expected point3d_id"),
         ("x, t, a, 1", "expected point3d_id"),
-        ("5, a, 1, b, 2", "upgrade kapture 1.0"),
+        ("5, a, 1, b, 2", "files of kapture 1.0 have no type"),
         ("5, t, a, -1", "with ids of 0 or more"),
         (f"5, t, a, {2**31}", "with ids of 0 or more"),
         ("5, t/u, a, 1", "cannot be a type name"),
