@@ -254,7 +254,7 @@ def sample(shared_data: Path, tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_all_poses_of_the_published_sample_equal_those_of_kapture(sample: Path) -> None:
     folder = sample / "a_map"
-    recording = Recording("a_map", folder)
+    recording = Recording(folder)
     poses = read_keyframe_poses(recording, 1, Missing(sample), on_earth=False)
     assert poses is not None
     frame = LocalFrame.around(poses)
