@@ -139,13 +139,9 @@ def in_image(camera: Camera, px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]
 
 
 def values_at(
-    image: NDArray[Any], camera: Camera, points_in_cam: NDArray[np.float64], outside: float
+    image: NDArray[Any], camera: Camera, px: NDArray[np.floating[Any]], outside: float
 ) -> NDArray[Any]:
-    """Return the values (N,) of an image (H, W) at the pixels of points (N, 3) in its camera.
-
-    Points that project outside the image get the value ``outside``.
-    """
-    px = px_from_cam(camera, points_in_cam)
+    """Return the values (N,) of a camera's image (H, W) at pixels (N, 2); ``outside`` beyond it."""
     inside = in_image(camera, px)
     column, row = px[inside].astype(np.int64).T
     values = np.full(len(px), outside, image.dtype)

@@ -156,7 +156,7 @@ def _look_up(
     usable = np.asarray(np.isfinite(px).all(axis=1))
     assert source.depth is not None
     if np.linalg.norm(source.depth.image_from_depth.translation) > _SAME_CENTRE_M:
-        usable &= _not_hidden(source, in_camera)
+        usable &= _not_hidden(source, in_camera, px)
     # in OpenCV, the centre of the first pixel is (0, 0)
     in_array = np.where(usable[:, None], px, -1e4) * shrink - 0.5
     x, y = np.ascontiguousarray(in_array.T, np.float32)
@@ -196,10 +196,10 @@ def _at_resolution(
     return image, mask, np.array(size) / (width, height)
 
 
-def _not_hidden(source: PosedImage, in_camera: Floats) -> NDArray[np.bool_]:
+def _not_hidden(source: PosedImage, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of the points, seen by the depth sensor, that the image also sees."""
     surface, _ = _seen_depth(source, source.camera, source.cam_from_world)
-    nearest = values_at(surface, source.camera, in_camera, outside=-np.inf)
+    nearest = values_at(surface, source.camera, px, outside=-np.inf)
     return in_camera[:, 2] <= (1.0 + _SAME_SURFACE) * nearest
 
 

@@ -19,6 +19,7 @@ from megloc_kapture.geometry.cameras import (
     STRUCTURED_LIGHT,
     depth_noise,
     focal_px,
+    px_from_cam,
     values_at,
 )
 from megloc_kapture.geometry.poses import rotation_angles_deg
@@ -333,7 +334,8 @@ def _overlaps(
             continue
         points = depth_cloud(view, options.depth, step_px=_OVERLAP_STEP_PX)
         seen = (depth_from_world @ scene.map_pose(name).inverse()).apply(points)
-        depth = values_at(query_depth.depth_m, query_depth.camera, seen, outside=0.0)
+        px = px_from_cam(query_depth.camera, seen)
+        depth = values_at(query_depth.depth_m, query_depth.camera, px, outside=0.0)
         with np.errstate(invalid="ignore"):
             agrees = (depth > 0) & (np.abs(seen[:, 2] - depth) <= options.max_distances_m[0])
         shares.append((name, float(agrees.mean()) if len(agrees) else 0.0))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import pixel_rays, values_at
+from megloc_kapture.geometry.cameras import pixel_rays, px_from_cam, values_at
 from megloc_kapture.geometry.poses import deviation_by_median
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
@@ -72,7 +72,8 @@ def depth_cloud(
     )
     if image_camera is None or image_mask is None:
         return points
-    return points[values_at(image_mask, image_camera, points, outside=True)]
+    px = px_from_cam(image_camera, points)
+    return points[values_at(image_mask, image_camera, px, outside=True)]
 
 
 def _on_edge(
