@@ -99,10 +99,11 @@ class VggNetVlad(nn.Module):
                 f"the network's input has {width}x{height} pixels, but needs at least "
                 f"{STRIDE_PX} on each side"
             )
-        features = self.features(image).float()
-        with torch.autocast(image.device.type, enabled=False):
+        device = image.device.type
+        features, is_half = self.features(image).float(), torch.is_autocast_enabled(device)
+        with torch.autocast(device, enabled=False):
             # in half precision, colours of 0 to 255 may overflow in this trunk
-            if not bool(features.isfinite().all()):
+            if is_half and not bool(features.isfinite().all()):
                 features = self.features(image)
             return self.vectors(features)
 
