@@ -259,14 +259,13 @@ def check_weights(options: PipelineOptions) -> None:
 
 
 def _missing(options: PipelineOptions) -> MissingWeightsError | None:
-    features, second = options.local_features, options.second_matching
-    rematches = options.triangulates() or second.queries
+    features = options.local_features
     matchers = [choice.matching or options.matching for choice in features]
+    second = [options.second_matcher(of_queries=of_queries) for of_queries in (False, True)]
     chosen: list[tuple[str, PluginChoice | None]] = [
         (SEGMENTERS, options.preprocessing.masks.segmenter),
         *((LOCAL_FEATURES, plugin) for plugin in features),
-        *((MATCHERS, plugin) for plugin in matchers),
-        (MATCHERS, second.matcher if rematches else None),
+        *((MATCHERS, plugin) for plugin in (*matchers, *second)),
         (POSE_RANKERS, options.localization.rank),
         *((POSE_REFINERS, plugin) for plugin in options.pose_refinement.by),
     ]

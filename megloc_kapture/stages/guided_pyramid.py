@@ -543,7 +543,7 @@ class PyramidMapping(_AgainStage):
     outputs = (MAPPING_PYRAMID,)
 
     def is_wanted(self) -> bool:
-        return self.options.rematches_map() and self.options.triangulates()
+        return self.options.rematches_map()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping = work.folder(self.mapping(), FEATURES, MAPPING_MATCHES)

@@ -120,12 +120,17 @@ class PipelineOptions(Options):
 
     def rematches_map(self) -> bool:
         """Return whether map pairs are matched again, by a second matcher or guided pyramids."""
-        return self.uses_pyramid() or self.second_matching.matcher is not None
+        second = self.second_matcher(of_queries=False)
+        return self.triangulates() and (self.uses_pyramid() or second is not None)
 
     def rematches_queries(self) -> bool:
         """Return whether pairs of queries are matched again."""
+        return self.uses_pyramid() or self.second_matcher(of_queries=True) is not None
+
+    def second_matcher(self, *, of_queries: bool) -> PluginChoice | None:
+        """Return the matcher that matches pairs of queries, or of map images, again, if any."""
         second = self.second_matching
-        return self.uses_pyramid() or (second.matcher is not None and second.queries)
+        return second.matcher if (second.queries if of_queries else self.triangulates()) else None
 
     def triangulates(self) -> bool:
         return self.map == "triangulate"
@@ -170,8 +175,8 @@ class PipelineOptions(Options):
 
     def make_second_matcher(self, *, of_queries: bool) -> Matcher | None:
         """Create the second matcher of queries or of map images; None if there is none."""
-        chosen = self.second_matching.matcher
-        if chosen is None or (of_queries and not self.second_matching.queries):
+        chosen = self.second_matcher(of_queries=of_queries)
+        if chosen is None:
             return None
         matcher: Matcher = load_chosen(MATCHERS, chosen, self.placement)
         return matcher

@@ -118,9 +118,13 @@ def test_eval_names_all_missing_weights_of_a_preset(
     assert "megloc weights fetch --preset megloc" in lines[-1]
     lightglue = ("name=lightglue", "options.weights=aliked_lightglue")
     sets = [part for each in lightglue for part in ("--set", f"second_matching.matcher.{each}")]
-    done = megloc("eval", "kapture", "--root", scene, *sets, "--dry-run")
+    command = ("eval", "kapture", "--root", scene, *sets, "--dry-run")
+    done = megloc(*command)
     assert done.status == 2 and done.out == ""
     assert done.err.startswith("megloc: the weights aliked_lightglue are missing: ")
+    # lifted maps have no pairs to match again
+    of_map = ("--set", "map=lift", "--set", "second_matching.queries=false")
+    assert "lightglue" not in megloc(*command, *of_map).err
 
 
 def test_a_restricted_licence_needs_consent_before_any_download(megloc: Any, folder: Path) -> None:
