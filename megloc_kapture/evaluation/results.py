@@ -307,7 +307,7 @@ def _read_mlad(
             if asked_pair.reference not in references:
                 problem = f"reference {asked_pair.reference!r} has no pose in the map"
                 raise DataError(problem, path=pose_file)
-            # the identity stands in for a missing pose: the file must have every row
+            # the identity marks a missing pose, since the file must have every row
             if pose != RigidTransform.identity():
                 local = pose_files.scaled_pose(pose, 1 / world.official_from_local.scale)
                 poses[asked_pair] = local @ references[asked_pair.reference]
