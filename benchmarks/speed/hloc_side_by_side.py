@@ -53,11 +53,11 @@ from megloc_kapture.io.tables import read_match_counts  # noqa: E402
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours  # noqa: E402
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
+from megloc_kapture.pipeline.presets import PRESETS  # noqa: E402
 from megloc_kapture.plugin_loading import load_plugin  # noqa: E402
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS  # noqa: E402
 from megloc_kapture.stages.map_points import triangulate_map  # noqa: E402
 from megloc_kapture.stages.matches import (  # noqa: E402
-    SecondMatchingOptions,
     match_pairs,
     pairs_to_rematch,
 )
@@ -68,10 +68,10 @@ from megloc_kapture.stages.query_poses import (  # noqa: E402
 from megloc_kapture.values import Camera, Pose, RigidTransform  # noqa: E402
 
 TYPE, FLOAT = "features", np.dtype("float32")
-ALIKED = {"max_keypoints": 2048, "threshold": 0.05, "device": "cpu"}
+MODERN = PRESETS["modern"]
+ALIKED = {**MODERN.local_features[0].options, "device": "cpu"}
 SIFT = {"sparse": {"first_octave": 0, "peak_threshold": 0.01}, "dense": {}}
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-WEAK = SecondMatchingOptions(min_matches=100, queries=False)
 KEEP_ALL = LocalizationOptions(min_confidence=0.0)  # as hloc; a rejected pose counts as a miss
 STEPS = ("match map", "triangulation", "match queries", "localization")
 HERE = Path(__file__).resolve().parent
@@ -113,7 +113,10 @@ def ours(job: dict[str, Any]) -> dict[str, Any]:
         if matcher is None or not job["second"]:
             return matched
         counts = {pair: row.verified for pair, row in read_match_counts(folder, TYPE).items()}
-        weak = [ImagePair(*pair, 1.0) for pair in pairs_to_rematch(counts, WEAK, of_both=True)]
+        weak = [
+            ImagePair(*pair, 1.0)
+            for pair in pairs_to_rematch(counts, MODERN.second_matching, of_both=True)
+        ]
         again = folder / "again"
         match_pairs(mapping, mapping, weak, TYPE, matcher, bound, again)
         return KaptureFolder(mapping.root, features_dirs=[features, again, folder])
