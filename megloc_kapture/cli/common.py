@@ -251,12 +251,13 @@ class Computing:
         return tuple(f"{name}={value}" for name, value in given.items() if value is not None)
 
     def placement(self) -> NetworkOptions:
-        from megloc_kapture.pipeline.presets import assigned, options_with  # slow import
+        # slow imports
+        from megloc_kapture.pipeline.presets import assigned, options_with
+        from megloc_kapture.stages.options import PipelineOptions
 
-        chosen = assigned(self.assignments())
-        half = chosen.get("precision") == "half"
-        placed = {"device": chosen.get("device", "auto"), "half_precision": half}
-        return options_with(NetworkOptions, placed)
+        chosen = assigned(self.assignments()).items()
+        placed = {key: value for key, value in chosen if key in ("device", "precision")}
+        return options_with(PipelineOptions, placed).placement
 
 
 @dataclass(frozen=True, kw_only=True)
