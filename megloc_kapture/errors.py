@@ -75,7 +75,7 @@ def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> s
 # imported package -> extra that installs it
 _EXTRAS = {
     "torch": "torch",
-    "kornia": "kornia",
+    "kornia": "torch",
     "distributed": "cluster",
     "h5py": "megadepth",
     **dict.fromkeys(("fastapi", "python_multipart", "starlette", "uvicorn"), "serve"),

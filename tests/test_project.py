@@ -13,6 +13,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from megloc_kapture.errors import _EXTRAS, missing_extra
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 PROJECT, TWINS = (
     tomllib.loads((REPOSITORY / folder / "pyproject.toml").read_text())["project"]
@@ -36,6 +38,12 @@ def test_dependencies_are_pinned_inside_their_ranges() -> None:
     versions = pins()
     for one in REQUIREMENTS:
         assert one.specifier.contains(versions[canonicalize_name(one.name)]), one.name
+
+
+def test_messages_name_extras_that_exist() -> None:
+    for package in _EXTRAS:
+        hint = missing_extra(ModuleNotFoundError(name=package)) or ""
+        assert re.findall(r"\[(.*)\]", hint)[0] in PROJECT["optional-dependencies"], package
 
 
 def test_nothing_is_there_that_breaks_others() -> None:
