@@ -46,7 +46,7 @@ class NvmModel:
 
 
 def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
-    """Read the only model of a file.
+    """Read a file with one model.
 
     A second model without points, which lists unregistered images, is ignored.
     """
@@ -69,17 +69,18 @@ def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
 def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDArray[np.float64]]:
     cameras: dict[str, list[float]] = {}
     for row in islice(rows, count):
-        name, *fields = row.split()
+        name, *fields = row.rsplit(maxsplit=10)  # the name may contain spaces
         with named(about=f"camera {name!r}"):
             focal, w, x, y, z, *center, k, _ = map(float, fields)
             quat_wxyz = unit_quaternion((w, x, y, z))
             cameras[check_relative(name.removeprefix("./"))] = [focal, *quat_wxyz, *center, k]
+    require(count, "the model has no images")
     require(
-        cameras and len(cameras) == count,
+        len(cameras) == count,
         f"found {len(cameras)} different images, expected {count}",
     )
     values = np.array(list(cameras.values())).reshape(-1, 9)
-    require(np.isfinite(values).all(), "not all cameras are finite")
+    require(np.isfinite(values).all(), "camera values are not finite")
     return tuple(cameras), values
 
 

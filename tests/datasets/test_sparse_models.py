@@ -82,6 +82,8 @@ def test_a_model_is_read_with_any_line_ends_and_trailer(tmp_path: Path) -> None:
         check_model(model)
     model = read_nvm(file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"]))
     assert model.names == ("db/7.jpg",) and len(model.points) == 0
+    model = read_nvm(file(tmp_path / "m.nvm", ["1", CAMERA.replace("/7", "/night 7"), "0"]))
+    assert model.names == ("db/night 7.jpg",)
 
 
 def test_known_variants_of_the_layout_are_read(tmp_path: Path) -> None:

@@ -98,7 +98,8 @@ def test_empty_and_binary_files_are_named(tmp_path: Path, reader: Reader) -> Non
         (read_nvm, " 1 3 30.125", " 9 3 30.125", None, "unknown image"),
         (read_nvm, "\n1\n1.5", "\n9\n1.5", None, "the file ends before its last point"),
         (read_nvm, "db/8", "db/7", None, "found 1 different images, expected 2"),
-        (read_nvm, "1000 1", "nan 1", None, "not all cameras are finite"),
+        (read_nvm, "2\ndb/7", "0\ndb/7", None, "the model has no images"),
+        (read_nvm, "1000 1", "nan 1", None, "camera values are not finite"),
         (read_nvm, "1000 1", "1000 1.005", None, "camera 'db/7.jpg': .*not a unit quaternion"),
         (read_nvm, "db/7", "../7", None, "camera '../7.jpg': .*leads out"),
         (
