@@ -124,9 +124,9 @@ def find_pixel_origin(
         elif centred:
             where = "and every principal point is ((w-1)/2, (h-1)/2)"
         else:
-            where = "and the principal points indicate no other origin"
+            where = "so COLMAP's corner is assumed"
         fit = "keypoints and intrinsics have the same origin"
-        reason = f"{fit if images else 'no observation to compare with'}, {where}"
+        reason = f"{fit if observed else 'no observation to compare with'}, {where}"
     shift_of_keypoints = _HALF if keypoints == "centre" else 0.0
     by_origin: dict[Origin, float] = {
         "corner": errors[shift_of_keypoints],
@@ -164,9 +164,13 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
         return None
     message = (
         f"the points do not fit the keypoints: {len(failing)} of {len(observed)} images, such as "
-        f"{failing[0]}, have a median reprojection error above {min(limits):.3g} px; the median "
-        f"over all images is {float(np.median(errors)):.3g} px"
+        f"{failing[0]}, have a median reprojection error above {min(limits):.3g} px; "
     )
+    median = float(np.median(errors))
+    if np.isfinite(median):
+        message += f"the median over these images is {median:.3g} px"
+    else:
+        message += "most points are behind the cameras"
     best, error = _likely_mistake(observed, xyz)
     if error > max(np.median(limits) / 2, 4.0) or error > np.median(errors) / 4:
         return message
@@ -193,7 +197,7 @@ def camera_fault(camera: Camera) -> str | None:
     ratios = lengths[straight > 0.02] / straight[straight > 0.02]
     if len(ratios) and not (ratios.min() > 0.5 and ratios.max() < 3.0):
         farthest = max(ratios.tolist(), key=lambda ratio: abs(math.log(max(ratio, 1e-6))))
-        return f"its distortion divides the distance from the principal point by {farthest:.2g}"
+        return f"its distortion shrinks image radii by a factor of {farthest:.2g}"
     return None
 
 

@@ -105,6 +105,7 @@ MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
         with_params(500.0, 330.0, 235.0, 50.0, model="SIMPLE_RADIAL"),
         "is impossible: its distortion",
     ),
+    "points behind": (with_points(lambda p: p - (0, 0, 50)), "most points are behind the cameras"),
     "random points": (
         with_points(lambda p: np.random.default_rng(1).uniform(-2, 2, p.shape)),
         "do not fit the keypoints: 9 of 9 images, such as .*, have",
