@@ -29,7 +29,7 @@ _ALONE = RigidTransform.identity()
 
 
 class Localizer:
-    """Estimates camera poses in a map from any tool, by the same steps as ``megloc eval``.
+    """Estimates camera poses in a map made by any tool, with the steps of ``megloc eval``.
 
     Matches of all keypoints types form one pose problem. Query features are given, or extracted if
     an extractor plugin for the map's type is installed. Candidates are ranked by global features;
@@ -134,9 +134,10 @@ class Localizer:
         try:
             return self._localize_unit(unit)
         except DataError as error:
-            if error.path is None or error.path not in [query.image for query, _ in unit]:
+            paths = [str(query.image) for query, _ in unit if isinstance(query.image, str | Path)]
+            if error.path is None or str(error.path) not in paths:
                 raise
-            return [unreadable_image(query.name, error.message) for query, _ in unit]
+            return [unreadable_image(query.name, str(error)) for query, _ in unit]
 
     def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
         with single_threaded():

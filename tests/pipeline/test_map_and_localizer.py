@@ -334,3 +334,15 @@ def test_many_queries_are_localized_lazily_and_in_order(
     for query, found in zip(queries, [first, *results], strict=True):
         assert errors(found, truth.cam_from_world(query.name))[0] < 0.02
     assert read == [query.name for query in queries]
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_an_unreadable_image_among_many_fails_alone(
+    localizer: Localizer, queries: list[Query], tmp_path: Path, kind: type
+) -> None:
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"no image")
+    camera = queries[0].camera
+    results = list(localizer.localize_many([(kind(broken), camera), queries[0]]))
+    assert isinstance(results[0], Failure) and str(broken) in results[0].reason
+    assert isinstance(results[1], Pose)
