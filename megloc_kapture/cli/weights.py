@@ -61,7 +61,7 @@ class List(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Fetch(Common):
-    """Download published weights, check them, and keep them."""
+    """Download published weights, check them, and save them."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
     """Names of networks, as listed."""
@@ -70,7 +70,7 @@ class Fetch(Common):
     accept_licence: bool = False
     """Agree to a licence that does not plainly allow commercial use."""
     force: Overwrite = False
-    """Replace an existing, different file."""
+    """Replace an existing file."""
 
     def run(self) -> None:
         names = self.names
@@ -82,8 +82,12 @@ class Fetch(Common):
             raise OptionError(f"choose weights to fetch: {', '.join(registry())}")
         wanted, refused = [], []
         for name in names:
+            weights = lookup(name)
+            if weights.to_fetch is None and (path := next(files_of(weights), None)):
+                print(f"{name}: already present, {path}")
+                continue
             try:
-                wanted.append(_fetchable(lookup(name), self.accept_licence))
+                wanted.append(_fetchable(weights, self.accept_licence))
             except (MissingWeightsError, OptionError) as error:
                 if self.preset is None:
                     raise
@@ -108,7 +112,7 @@ class Fetch(Common):
         state = "sha256 correct"
         if file.sha256 is None:
             downloaded = describe(weights.name, place)
-            state = f"sha256 {sha256_of(downloaded)}; the registry has no sha256 to compare"
+            state = f"sha256 {sha256_of(downloaded)}; the registry lists no sha256"
             if not file.convert:
                 try:
                     read_weights(downloaded)
@@ -158,13 +162,14 @@ class Check(Common):
     """Check the existing files: sha256 if known, and safe loading."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
-    """Names of networks, as listed; if omitted, all networks that have a file."""
+    """Names of networks, as listed; if omitted, all that are present."""
 
     def run(self) -> int:
         """Return 2 if a file is wrong."""
-        wrong = sum(_wrong(lookup(name)) for name in self.names)
-        if not self.names:
-            wrong = sum(_wrong(w) for w in registry().values() if _state(w) == "present")
+        present = [name for name, of in registry().items() if _state(of) == "present"]
+        names = self.names or present
+        check_option(names, f"{weights_folder()}: no weights to check")
+        wrong = sum(_wrong(lookup(name)) for name in names)
         print(f"wrong files: {wrong}" if wrong else "all files are correct")
         return WRONG_FILES if wrong else 0
 
@@ -214,7 +219,7 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
 
 
 def _wrong(weights: Weights) -> int:
-    """Print the state of each file of a network; return the number of wrong files."""
+    """Print the state of each file of a network; return the number of problems."""
     wrong = 0
     paths = list(files_of(weights))
     if not paths:
@@ -273,7 +278,7 @@ class Doctor(Common):
         for problem in problems:
             print(f"problem: {problem}")
         if problems:
-            raise MeglocError(f"{len(problems)} problems found, see above")
+            raise MeglocError(f"problems found: {len(problems)}, see above")
         print("no problem found")
 
 
@@ -290,7 +295,7 @@ def find_problems() -> list[str]:
     """Return installed combinations of packages that are known to fail, with remedies."""
     problems = []
     torch, vision = installed_version("torch"), installed_version("torchvision")
-    if vision and torch and "+cpu" in torch:
+    if vision and torch and "+cpu" in torch and "+cpu" not in vision:
         problems.append(
             f"torchvision {vision} may fail to import with torch {torch}, and then breaks "
             "transformers; pip uninstall torchvision"

@@ -89,10 +89,13 @@ def test_fetch_downloads_and_checks_files(megloc: Any, folder: Path) -> None:
     free, unknown = done.out.splitlines()
     assert free == f"free: {folder}/free.pth ({len(FREE)} bytes, sha256 correct)"
     assert unknown.endswith(
-        f"sha256 {hashlib.sha256(UNKNOWN).hexdigest()}; the registry has no sha256 to compare)"
+        f"sha256 {hashlib.sha256(UNKNOWN).hexdigest()}; the registry lists no sha256)"
     )
     assert "licence: SHORT: for looking at only" in done.err
     assert (folder / "free.pth").read_bytes() == FREE
+    (folder / "by-hand.pth").write_bytes(FREE)
+    by_hand = megloc("weights", "fetch", "by-hand").out
+    assert by_hand == f"by-hand: already present, {folder}/by-hand.pth\n"
     again = megloc("weights", "fetch", "free", "-q")
     assert (again.out, again.err) == (f"free: already present, {folder}/free.pth\n", "")
 
@@ -172,6 +175,7 @@ def test_wrong_and_missing_downloads_are_refused(megloc: Any, served: Path) -> N
 
 
 def test_files_are_listed_and_damaged_and_missing_ones_named(megloc: Any, folder: Path) -> None:
+    megloc("weights", "check").refused("no weights to check")
     folder.mkdir()
     (folder / "free.pth").write_bytes(FREE)
     rows = [line.split() for line in megloc("weights", "list").out.splitlines()]
