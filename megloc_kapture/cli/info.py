@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from megloc_kapture.cli.common import Common, Reading
 from megloc_kapture.cli.maps import report_lines
 from megloc_kapture.datasets.kapture_folders import cameras_of_folder
-from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.errors import DataError, MeglocError, OptionError
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.kapture import KaptureFolder
@@ -65,7 +65,7 @@ class Info(Reading, Common):
     pixel_origin: PixelOriginChoice = "auto"
     """Pixel origin of the map's intrinsics; auto detects it."""
     deep: bool = False
-    """Read every file, images included."""
+    """Also read all images and matches."""
 
     def run(self) -> None:
         folder = self.kapture(self.opened_map(self.input))
@@ -87,7 +87,7 @@ class Info(Reading, Common):
     def _describe_map(self, root: Path) -> None:
         try:
             opened = self.open_map(root, self.keypoints_type, self.pixel_origin)
-        except MeglocError as error:
+        except DataError as error:
             line("localizing", f"not possible: {error}")
             return
         unknown = "units of the map, of unknown scale"
@@ -122,7 +122,7 @@ def describe_content(folder: KaptureFolder) -> None:
         joined = len(depth_records(data))
         # a depth map belongs to an image if a rig links their sensors
         use = "" if joined else ": ignored, as no rig links their sensor to a camera"
-        line("depth maps", f"{len(data.records_depth)}, of {joined} images{use}")
+        line("depth maps", f"{len(data.records_depth)}, for {joined} images{use}")
     for kind in ARRAY_KINDS:
         for name in folder.types(kind):
             reader = folder.features(kind, name)
@@ -163,7 +163,7 @@ def describe_refinement(folder: KaptureFolder) -> None:
     if len(known):
         at = np.quantile(known, _QUANTILES)
         text = ", ".join(f"{100 * q:g} %: {d:.3g}" for q, d in zip(_QUANTILES, at, strict=True))
-        line("", f"largest standard deviation for 1 px of noise, percentiles: {text}")
+        line("", f"worst-axis standard deviation for 1 px noise, percentiles: {text}")
 
 
 def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
@@ -215,13 +215,13 @@ class OptionsCommand(Common):
     preset: str = DEFAULT_PRESET
     """Show the values of this preset."""
     basic: bool = False
-    """Show only the ten options that are changed most often."""
+    """Without KEY: show only the ten options that are changed most often."""
 
     def run(self) -> None:
         every = list(options_of(options_of_preset(self.preset)))
         selected = [option for option in every if _is_below(option[0], self.key)]
-        if self.basic:
-            selected = [option for option in selected if option[0] in BASIC_OPTIONS] or selected
+        if self.basic and not self.key:
+            selected = [option for option in selected if option[0] in BASIC_OPTIONS]
         if not selected:
             selected = list(_options_of_plugins(self.key))
         if not selected:
@@ -240,25 +240,25 @@ class OptionsCommand(Common):
 
 
 def shown(value: Any) -> str:
-    """Format a value for ``--set``."""
-    if isinstance(value, PluginChoice) and not value.options:
-        return value.name
-    if isinstance(value, Options):
-        return _inline(value.model_dump(mode="json", exclude_defaults=True))
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(shown(item) for item in value)}]"
-    if value is None or isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    """Format a value as ``--set`` takes it; floats have four digits."""
+    text = _inline(value)
+    return text[1:-1] if text.startswith('"') else text
 
 
 def _inline(value: Any) -> str:
-    """Format as an inline value of TOML, which is JSON but for tables."""
+    """Format as inline TOML, which equals JSON except for tables."""
+    if isinstance(value, Options):
+        table = value.model_dump(mode="json", exclude_defaults=True)
+        if isinstance(value, PluginChoice):
+            table = {"name": value.name, **table}
+        return _inline(table["name"] if table.keys() == {"name"} else table)
     if isinstance(value, dict):
         return f"{{{', '.join(f'{key} = {_inline(item)}' for key, item in value.items())}}}"
-    if isinstance(value, list):
+    if isinstance(value, tuple | list):
         return f"[{', '.join(map(_inline, value))}]"
-    return json.dumps(value)
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return json.dumps("none" if value is None else value, ensure_ascii=False)
 
 
 def _type_name(annotation: Any) -> str:
