@@ -58,8 +58,8 @@ class Localize(Reading, Deciding, Common):
     """Instead of --query: photographs, videos, or folders of them. Focal lengths start from
     EXIF or a guess and are refined with the poses."""
     camera: str | None = None
-    """Camera of all --images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS as
-    in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
+    """MODEL,WIDTH,HEIGHT,PARAMETERS as in COLMAP for all --images, or a file with a row NAME MODEL
+    WIDTH HEIGHT PARAMETERS per image; disables rotation by EXIF."""
     every: int | None = None
     """Use every N-th frame of the videos among --images; if omitted, 30."""
     output: Output = Path("localized")
@@ -89,15 +89,17 @@ class Localize(Reading, Deciding, Common):
         kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
         _check_consistent(kapture_map, self.input, force=self.force)
         options = self.options()
-        given = None if self.pairs is None else candidates_of(read_pairs(self.pairs))
+        candidates = None if self.pairs is None else candidates_of(read_pairs(self.pairs))
         # fail before the first query and before anything is written
         localizer = Localizer(kapture_map, options=options)
-        results = Results(localizer, folder, workers=workers, candidates=given, track=self.track)
+        results = Results(
+            localizer, folder, workers=workers, candidates=candidates, track=self.track
+        )
         queries = results.queries
-        if given is not None:
+        if candidates is not None:
             names, images = set(queries.names), set(kapture_map.images)
             require(
-                any(name in names and not images.isdisjoint(c) for name, c in given.items()),
+                any(name in names and not images.isdisjoint(c) for name, c in candidates.items()),
                 "no row names both a query and a map image; a valid row would be: "
                 f"{min(names)}, {min(images)}, 1.0",
                 path=self.pairs,
@@ -105,16 +107,16 @@ class Localize(Reading, Deciding, Common):
         inputs = (path, self.query)
         with staged_output(self.output, kind=LOCALIZED, force=self.force, inputs=inputs) as out:
             started = time.perf_counter()
-            named = list(results.items())
+            outcomes = list(results.items())
             seconds = time.perf_counter() - started
             counts = results.write_to(out)
         how = "as given"
-        if given is None:
+        if candidates is None:
             how = localizer.matching.describe_candidates(queries.types_of_all())
         self.say(f"localizing with {', '.join(local.name for local in localizer.types)}")
         self.say(f"candidates: {how}")
         self.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
-        remarks = Counter(remark for _, result in named for remark in result.remarks)
+        remarks = Counter(remark for _, result in outcomes for remark in result.remarks)
         focal = {remark for remark in remarks if "focal length" in remark}
         for remark in sorted(remarks.keys() - focal):
             self.say(f"skipped for {remarks[remark]} queries: {remark}")
@@ -123,16 +125,20 @@ class Localize(Reading, Deciding, Common):
         if misfits := misfits_text(results.values(), STATUS_FILE):
             self.say(misfits)
         print(
-            f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s; "
-            f"poses and status.csv in {self.output}"
+            f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s"
             + (f", {counts['fallbacks']} fallback poses" if counts["fallbacks"] else "")
+            + f"; poses and status.csv in {self.output}"
         )
         if counts["queries"] and not counts["localized"]:
             self.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
 
     def _check_queries(self) -> None:
         if (self.query is None) == (not self.images):
-            raise OptionError("give the queries: --query (a kapture folder) or --images")
+            raise OptionError("give either --query (a kapture folder) or --images")
+        check_option(
+            self.query is None or (self.camera is None and self.every is None),
+            "--camera and --every are for --images; a kapture folder has cameras",
+        )
         check_option(
             self.query is None or not self.query.is_file(),
             f"--query {self.query}: not a kapture folder; a list of cameras goes to "
@@ -195,7 +201,7 @@ class Serve(Reading, Deciding, Common):
             localizer = prepared_localizer(kapture_map, options)
             host = f"[{self.host}]" if ":" in self.host else self.host
             where = f"http://{host}:{bound.getsockname()[1]}/"
-            print(f"{len(kapture_map.images)} map images, served at {where}")
+            print(f"listening at {where}, {len(kapture_map.images)} map images")
             log_requests = logging.getLogger().isEnabledFor(logging.INFO)
             service = Service(localizer, **limits, token=token)
             try:
@@ -206,7 +212,7 @@ class Serve(Reading, Deciding, Common):
 
 
 def _read_token(path: Path) -> str:
-    """Read a token of one line of printable ASCII."""
+    """Read a one-line token of printable ASCII."""
     token = read_text(path).strip()
     require(
         len(token) >= _MIN_TOKEN_LENGTH and token.isascii() and token.isprintable(),

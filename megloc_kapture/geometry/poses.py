@@ -1,6 +1,6 @@
 """Pose algebra on arrays, and alignment of maps.
 
-Quaternions (..., 4) are ordered w x y z, translations (..., 3), both float64. As in
+Quaternions (..., 4), ordered w x y z, and translations (..., 3) are float64. As in
 :class:`megloc_kapture.values.RigidTransform`, ``a_from_b`` maps ``x_a = R x_b + t``, transforms
 compose right to left, and ``q`` and ``-q`` are one rotation.
 """
@@ -30,9 +30,9 @@ _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
 _LATITUDE_ROUNDS = 8
 _ALIGNING_ROUNDS = 50
 _ALIGNING_PAIRS = 200  # enough: if half of the poses are correct, so is a quarter of the pairs
-# largest angle of agreeing poses; one of 30,000 random rotations agrees by chance
+# largest angle between agreeing poses; one of 30,000 random rotations agrees by chance
 _AGREEMENT_DEG = 5.0
-# largest distance of agreeing centres, as a share of the centres' median distance from their median
+# largest distance between agreeing centres, relative to the target centres' spread
 _AGREEMENT_OF_SPREAD = 0.1
 # smallest spread of the positions along their second principal axis, as a multiple of the residual,
 # that determines the scale and the axes
@@ -51,7 +51,7 @@ def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Floats, Floats]:
 
 
 def unstack_poses(quats_wxyz: Floats, translations: Floats) -> list[RigidTransform]:
-    """Build transforms of quaternions (N, 4) and translations (N, 3)."""
+    """Build transforms from quaternions (N, 4) and translations (N, 3)."""
     return [
         RigidTransform((w, x, y, z), (tx, ty, tz))
         for (w, x, y, z), (tx, ty, tz) in zip(
@@ -108,7 +108,7 @@ def rotate(quats_wxyz: Floats, vectors: Floats) -> Floats:
 def compose(
     quats_ab: Floats, translations_ab: Floats, quats_bc: Floats, translations_bc: Floats
 ) -> tuple[Floats, Floats]:
-    """Compose ``a_from_b`` and ``b_from_c`` to ``a_from_c`` with unit quaternions (..., 4)."""
+    """Return ``a_from_c`` of ``a_from_b`` and ``b_from_c``, with unit quaternions (..., 4)."""
     quats = normalize_quats(multiply_quats(quats_ab, quats_bc))
     return quats, rotate(quats_ab, translations_bc) + translations_ab
 
@@ -264,7 +264,7 @@ def align_poses(
     """
     number = len(source[0])
     if number < 3:
-        raise DataError(f"{number} poses have a true pose; an alignment needs 3 or more")
+        raise DataError(f"{number} poses have ground truth; an alignment needs 3 or more")
     centers = camera_centers(*source), camera_centers(*target)
     axes = rotation_matrices(source[0]), rotation_matrices(target[0])
     spread = np.median(np.linalg.norm(centers[1] - np.median(centers[1], axis=0), axis=1))

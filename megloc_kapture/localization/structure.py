@@ -60,7 +60,7 @@ class StructureDistance:
     def distance(
         self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> float:
-        """Return the distance of RGB images uint8 (H, W, 3) over the valid pixels (H, W), 0 to 2.
+        """Return the distance (0 to 2) between RGB images uint8 (H, W, 3) over valid pixels (H, W).
 
         Infinite if no window is at least half valid.
         """
@@ -153,17 +153,19 @@ def _displacements_px(
     rows = rows[:: max(1, math.ceil(len(rows) / _MAX_POINTS))]
     displacements: list[float] = []
     try:
-        pixels = _grey_levels(scene.query_image(query))
+        query_grey = _grey_levels(scene.query_image(query))
         for image in most:
-            shown = points[[row for row in rows if shown_by[row] == image]]
-            displacements += _displacements_in(pixels, camera, cam_from_world, shown, image, scene)
+            points_in_image = points[[row for row in rows if shown_by[row] == image]]
+            displacements += _displacements_in(
+                query_grey, camera, cam_from_world, points_in_image, image, scene
+            )
     except DataError:
         return np.zeros(0)
     return np.array(displacements)
 
 
 def _displacements_in(
-    pixels: NDArray[np.uint8],
+    query_grey: NDArray[np.uint8],
     camera: Camera,
     cam_from_world: RigidTransform,
     points: NDArray[np.float64],
@@ -171,18 +173,18 @@ def _displacements_in(
     scene: RankingScene,
 ) -> list[float]:
     map_camera, map_pose = scene.map_camera(image), scene.map_pose(image)
-    shown = _grey_levels(scene.map_image(image))
+    map_grey = _grey_levels(scene.map_image(image))
     with np.errstate(invalid="ignore", divide="ignore"):
-        here, in_map = (
+        in_query, in_map = (
             project(camera, cam_from_world, points),
             project(map_camera, map_pose, points),
         )
-        z_here, z_there = cam_from_world.apply(points)[:, 2], map_pose.apply(points)[:, 2]
-        scales = (focal_px(camera) / z_here) / (focal_px(map_camera) / z_there)
-        usable = (scales > 1 / _MAX_SCALE) & (scales < _MAX_SCALE) & (z_here > 0)
-    usable &= np.isfinite(here).all(axis=1) & np.isfinite(in_map).all(axis=1)
-    turn = (cam_from_world @ map_pose.inverse()).rotation_matrix()
-    angle = math.atan2(turn[1, 0], turn[0, 0])
+        z_query, z_map = cam_from_world.apply(points)[:, 2], map_pose.apply(points)[:, 2]
+        scales = (focal_px(camera) / z_query) / (focal_px(map_camera) / z_map)
+        usable = (scales > 1 / _MAX_SCALE) & (scales < _MAX_SCALE) & (z_query > 0)
+    usable &= np.isfinite(in_query).all(axis=1) & np.isfinite(in_map).all(axis=1)
+    query_from_map = (cam_from_world @ map_pose.inverse()).rotation_matrix()
+    angle = math.atan2(query_from_map[1, 0], query_from_map[0, 0])
     side, displacements = 2 * _HALF_PATCH_PX + 1, []
     for row in np.flatnonzero(usable):
         cos, sin = math.cos(angle) / scales[row], -math.sin(angle) / scales[row]
@@ -190,12 +192,12 @@ def _displacements_in(
         middle = in_map[row] - 0.5  # in OpenCV, the centre of the first pixel is (0, 0)
         map_from_patch[:, 2] = middle - map_from_patch[:, :2].sum(axis=1) * _HALF_PATCH_PX
         patch = cv2.warpAffine(
-            shown, map_from_patch, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            map_grey, map_from_patch, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         )
         if patch.std() < _MIN_DEVIATION:
             continue
         around = cv2.getRectSubPix(
-            pixels, (side + 2 * _SEARCH_PX,) * 2, tuple((here[row] - 0.5).tolist())
+            query_grey, (side + 2 * _SEARCH_PX,) * 2, tuple((in_query[row] - 0.5).tolist())
         )
         likeness = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
         y, x = np.unravel_index(int(np.argmax(likeness)), likeness.shape)

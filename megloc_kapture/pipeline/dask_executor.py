@@ -29,12 +29,12 @@ _PACKAGES = ["megloc_kapture", "numpy", "torch"]
 
 
 def _check_versions(versions: Mapping[str, Any]) -> None:
-    """Raise MeglocError if a worker has a package in another version than this process."""
+    """Raise MeglocError if a worker's package version differs from this process's."""
     here = versions["client"]["packages"]
     for address, worker in versions["workers"].items():
         there = worker["packages"]
         for name in _PACKAGES:
-            if there[name] not in (here[name], None):  # work fails if a package is missing
+            if there[name] not in (here[name], None):  # missing packages fail with their own error
                 raise MeglocError(
                     f"package versions differ on the cluster: worker {address} has {name} "
                     f"{there[name]}, here it is {here[name]}"
@@ -66,7 +66,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             client.register_plugin(_Preparation(Path.cwd(), shared.absolute()))
             executor: Any = client.get_executor(pure=False)
             executor.window = _ITEMS_PER_WORKER * threads
-            # workers of a scheduler may be on other machines, with GPUs of those machines
+            # workers of a scheduler may be on other machines, with their own GPUs
             executor.is_elsewhere = scheduler is not None
             yield executor
         except KilledWorker as error:

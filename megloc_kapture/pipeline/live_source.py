@@ -182,7 +182,7 @@ class LocalType:
             name=image.query.name,
         )
         skipped = retried.skipped
-        remark = f"guided pyramid matching: skipped {skipped}" if skipped else ""
+        remark = f"guided pyramid matching: {skipped}" if skipped else ""
         return np.concatenate([query.keypoints_px, retried.added_px]), retried.matches, remark
 
     @cached_property
