@@ -92,6 +92,23 @@ def test_version_1_0_is_read(root: Path, tmp_path: Path) -> None:
     assert not (out / "query_gt").exists()
 
 
+def test_without_the_list_of_cameras_those_of_the_model_are_centred(
+    root: Path, root11: Path
+) -> None:
+    (root / LIST).unlink()
+    dataset = read(root, version="1.0")
+    cameras = [dataset.mapping.camera_of(name) for name in ("db/3.jpg", "db/1228.jpg")]
+    assert cameras == [
+        Camera("SIMPLE_RADIAL", 8, 6, (12, 4, 3, -0.25)),
+        Camera("SIMPLE_RADIAL", 6, 8, (11, 3, 4, 0.5)),
+    ]
+    assumed = [
+        any("assumed to be the image centres" in remark for remark in read_dataset.remarks)
+        for read_dataset in (dataset, read(root11))
+    ]
+    assert assumed == [True, False]
+
+
 def test_tables_have_the_names_conditions_and_protocol_of_the_challenge(
     root11: Path, tmp_path: Path
 ) -> None:
