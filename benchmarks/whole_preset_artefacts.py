@@ -199,7 +199,7 @@ _ARTEFACTS: dict[str, dict[str, Reader]] = {
     "global_features": {"global_features": _features},
     "mapping_pairs": {"pairs/mapping.txt": _pairs},
     "mapping_matches": {"matches/mapping": _features},
-    "mapping_pyramid": {"pyramid/mapping": _features},
+    "mapping_rematching": {"pyramid/mapping": _features},
     "points": {"map_unrefined": _map},
     "map": {
         "map": _map,
@@ -209,7 +209,7 @@ _ARTEFACTS: dict[str, dict[str, Reader]] = {
     "query_candidates": {"pairs/query_candidates.txt": _pairs},
     "query_matches": {"matches/query": _features},
     "query_pairs": {"pairs/query.txt": _pairs},
-    "query_pyramid": {"pyramid/query": _features},
+    "query_rematching": {"pyramid/query": _features},
     "localization": {
         "localized_unrefined": _folder,
         "localized_unrefined/status.csv": _table,

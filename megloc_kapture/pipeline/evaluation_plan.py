@@ -32,7 +32,7 @@ from megloc_kapture.pipeline.presets import assigned, check_weights, options_of_
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES, RenderedDataset
-from megloc_kapture.stages.guided_pyramid import PyramidQueries
+from megloc_kapture.stages.guided_pyramid import RematchQueries
 from megloc_kapture.stages.image_pairs import PairQueries
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.matches import MatchQueries
@@ -178,7 +178,7 @@ PIPELINE: tuple[type[PipelineStage], ...] = (
     PairQueries,
     MatchQueries,
     RerankQueries,
-    PyramidQueries,
+    RematchQueries,
     LocalizeQueries,
     RefinePoses,
 )

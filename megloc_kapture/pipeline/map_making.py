@@ -53,7 +53,7 @@ from megloc_kapture.pipeline.presets import (
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
-from megloc_kapture.stages.guided_pyramid import PyramidMapping
+from megloc_kapture.stages.guided_pyramid import RematchMapping
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
@@ -86,7 +86,7 @@ _WITHOUT_POSES: tuple[type[PipelineStage], ...] = (
     ExtractGlobalFeatures,
     PairMapping,
 )
-_WITH_POSES: tuple[type[PipelineStage], ...] = (MatchMapping, PyramidMapping, MakePoints, RefineMap)
+_WITH_POSES: tuple[type[PipelineStage], ...] = (MatchMapping, RematchMapping, MakePoints, RefineMap)
 MAP_STAGES: tuple[type[PipelineStage], ...] = (*_WITHOUT_POSES, *_WITH_POSES, Densify)
 
 

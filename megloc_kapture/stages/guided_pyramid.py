@@ -458,19 +458,18 @@ def _retry(
     )
 
 
-class _AgainStage(PipelineStage):
+class _Rematching(PipelineStage):
     """Match some pairs again by a second matcher, then pairs with few matches by pyramids."""
 
     version = 4
     matches: ClassVar[str]
     of_queries: ClassVar[bool]
     explained_by = (
+        "second_matching.matcher",
+        "second_matching.min_matches",
         "guided_pyramid.mode",
         "guided_pyramid.min_matches",
         "guided_pyramid.count",
-        "second_matching.matcher",
-        "second_matching.pairs",
-        "second_matching.min_matches",
     )
 
     def second_matcher(self) -> Matcher | None:
@@ -527,10 +526,10 @@ def _named(pairs: Sequence[ImagePair]) -> set[_Pair]:
     return {names for p in pairs for names in ((p.query, p.map), (p.map, p.query))}
 
 
-class PyramidMapping(_AgainStage):
+class RematchMapping(_Rematching):
     """Match pairs of map images again: by a second matcher, and at other scales and rotations."""
 
-    name = "mapping_pyramid"
+    name = "mapping_rematching"
     matches, of_queries = MAPPING_MATCHES, False
     uses = (
         *MATCHING_OPTIONS,
@@ -551,10 +550,11 @@ class PyramidMapping(_AgainStage):
         return self._match_again(work, mapping, mapping, pairs, self.options.verify_mapping())
 
 
-class PyramidQueries(_AgainStage):
-    """Match queries with candidates again; see :class:`PyramidMapping`."""
+class RematchQueries(_Rematching):
+    """Match queries with candidates again; see :class:`RematchMapping`."""
 
-    name = "query_pyramid"
+    name = "query_rematching"
+    explained_by = ("second_matching.queries", *_Rematching.explained_by)
     matches, of_queries = QUERY_MATCHES, True
     uses = (
         *MATCHING_OPTIONS,

@@ -283,6 +283,8 @@ def _option_text(options: Any, key: str) -> str:
     value = options
     for name in key.split("."):
         value = getattr(value, name)
+    if isinstance(value, bool):
+        return str(value).lower()
     several = value if isinstance(value, tuple) else () if value is None else (value,)
     return " + ".join(str(getattr(item, "name", item)) for item in several) or "none"
 

@@ -362,8 +362,9 @@ def test_each_stage_has_a_reason() -> None:
         "reranking.by = verified, reranking.keep = 20, reranking.local_type = superpoint"
     )
     assert "localization.min_confidence = 0.0" in lines["localization"]["why"]
-    changed = lines_of("aachen", "megloc", "guided_pyramid.mode=off")["query_pyramid"]
-    assert not changed["on"] and changed["why"].startswith("guided_pyramid.mode = off")
+    changed = lines_of("aachen", "megloc", "guided_pyramid.mode=off")["query_rematching"]
+    assert not changed["on"] and "guided_pyramid.mode = off" in changed["why"]
+    assert changed["why"].startswith("second_matching.queries = true, ")
     inloc = lines_of("inloc", "megloc")
     assert inloc["points"] == {"name": "points", "on": True, "why": "map = lift"}
     assert inloc["refine_poses"]["why"].endswith("references = map images of the query's cluster")

@@ -180,7 +180,7 @@ def guided(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """A run with guided pyramids."""
     options = options_of_preset(assignments=[FEW, *(f"guided_pyramid.{one}" for one in PYRAMID)])
     root = tmp_path_factory.mktemp("pyramid") / "workspace"
-    return evaluated(root, scene, options, last="query_pyramid")
+    return evaluated(root, scene, options, last="query_rematching")
 
 
 @pytest.fixture

@@ -52,8 +52,8 @@ CHANGES = (
 )
 STAGES = [
     *("import", "preprocess", "local_features", "global_features"),
-    *("mapping_pairs", "mapping_matches", "mapping_pyramid", "points", "map"),
-    *("query_candidates", "query_matches", "query_pairs", "query_pyramid"),
+    *("mapping_pairs", "mapping_matches", "mapping_rematching", "points", "map"),
+    *("query_candidates", "query_matches", "query_pairs", "query_rematching"),
     *("localization", "refine_poses", "submission", "evaluation"),
 ]
 
