@@ -74,7 +74,7 @@ def _text_of(error: Exception, path: Path | str | None) -> str:
             return "the file is empty"
         if start.startswith(b"version https://git-lfs"):
             return "a Git LFS pointer; fetch the file with `git lfs pull`"
-        if start[:9].lower() in (b"<!doctype", b"<html>", b"<html lan"):
+        if start.lower().startswith((b"<!doctype", b"<html")):
             return "a web page; download the file itself"
     text = getattr(error, "strerror", None) or str(error)
     return " ".join(re.sub(r"<\S+ object at \S+>|[.;]\s.*", "", text, flags=re.S).split())

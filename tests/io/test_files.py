@@ -230,6 +230,7 @@ def test_kapture_data_of_others_is_not_replaced_even_if_forced(tmp_path: Path) -
             "a Git LFS pointer; .*`git lfs pull`",
         ),
         (b"\n<!DOCTYPE html><html>", "a web page; download the file itself"),
+        (b"<html>\r\n<head>", "a web page; download the file itself"),
         (b"P6 1", "no header"),
     ],
 )
