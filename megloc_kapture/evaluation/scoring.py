@@ -44,11 +44,12 @@ _CHI2_95 = 12.592  # 95 % quantile for six degrees of freedom
 
 NO_POSE = "no pose in the result"
 Outcome = Literal["localized", "fallback", "missing"]
+_COUNTS = ("num_matches", "num_inliers")
 # column of a table of queries -> attribute
 _COLUMNS = {
     **{"image": "name", "condition": "condition", "outcome": "outcome"},
     **{"position_error_m": "position_m", "angle_error_deg": "angle_deg"},
-    **{name: name for name in ("num_matches", "num_inliers", "confidence", "reason")},
+    **{name: name for name in (*_COUNTS, "confidence", "reason")},
 }
 
 
@@ -114,7 +115,7 @@ class Reported:
         import pandas as pd  # slow import
 
         columns = {
-            name: pd.array(values, dtype="Int64") if "num_" in name else values
+            name: pd.array(values, dtype="Int64") if name.endswith(_COUNTS) else values
             for name, values in self.per_query().items()
         }
         return pd.DataFrame(columns).set_index("image")

@@ -210,6 +210,12 @@ def test_localization_results_have_reasons_and_inliers(world: Any) -> None:
     assert actual.label == "mine"
 
 
+def test_labels_do_not_decide_the_type_of_a_column(world: Any) -> None:
+    first, second = (evaluate(world.estimated, world.truth, label=f"num_{k}") for k in (5, 10))
+    table = first.compare(second).to_pandas()
+    assert set(table["num_5: outcome"]) == {"localized", "missing"}
+
+
 @pytest.mark.parametrize("kind", ["binary without points", "images.bin", "images.txt", "text"])
 def test_colmap_models_are_truth_and_result(
     world: Any, truth: Path, tmp_path: Path, kind: str
