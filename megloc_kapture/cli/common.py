@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -95,7 +96,8 @@ def cameras_of_text(text: str | None) -> Camera | dict[str, Camera] | None:
     """Parse a camera as :func:`camera_of_text` does, or read a camera list file."""
     if text is None:
         return None
-    return read_cameras(Path(text)) if Path(text).is_file() else camera_of_text(text)
+    # not Path.is_file, which raises an error for a text that is too long for a file name
+    return read_cameras(Path(text)) if os.path.isfile(text) else camera_of_text(text)
 
 
 @dataclass(frozen=True, kw_only=True)

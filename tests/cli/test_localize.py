@@ -15,11 +15,13 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 from PIL import Image
 
+from megloc_kapture.cli.common import cameras_of_text
 from megloc_kapture.cli.main import main
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
 from megloc_kapture.io.tables import read_status
+from megloc_kapture.values import Camera
 from tests.cli.foreign import DESCRIPTORS, FOREIGN_MAPS, KEYPOINTS, rename_type
 from tests.worlds import folder_bytes
 
@@ -157,6 +159,13 @@ def test_a_map_whose_points_contradict_its_keypoints_is_refused_unless_forced(
     assert megloc(*command, "-f").status == 0
     assert "the poses may be wrong" in caplog.text
     assert len(read_status(tmp_path / "localized" / "status.csv")) == 4
+
+
+def test_a_camera_may_be_longer_than_a_file_name() -> None:
+    """COLMAP writes 17 digits per parameter."""
+    params = (*(1234.5678901234567,) * 4, *(-0.0012345678901234567,) * 8)
+    text = ",".join(map(str, ("FULL_OPENCV", 4032, 3024, *params)))
+    assert len(text) > 255 and cameras_of_text(text) == Camera("FULL_OPENCV", 4032, 3024, params)
 
 
 # upright, and a camera held sideways, by EXIF
