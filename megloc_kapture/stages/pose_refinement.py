@@ -26,6 +26,7 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
+from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
@@ -285,7 +286,7 @@ def refine_poses(
     poses = {name: result for name, result in results.items() if isinstance(result, Pose)}
     refiners.test(poses.values(), work=work)
     jobs = [(image, pose, *refiners.uses(pose)) for image, pose in poses.items()]
-    refine = partial(_refine, refiners.map, query, refiners.refiners)
+    refine = partial(_refine, refiners.map, query, localized, refiners.refiners)
     refined = list(work.map(refine, jobs, "refining", plugins=refiners.refiners))
     results |= {pose.name: pose for pose in refined}
     trajectories = {data.record_of(pose.name): pose.cam_from_world for pose in refined}
@@ -332,10 +333,14 @@ def _read_results(localized: KaptureFolder) -> dict[str, LocalizationResult]:
 def _refine(
     mapping: KaptureFolder,
     query: KaptureFolder,
+    localized: KaptureFolder,
     refiners: Sequence[PoseRefiner],
     job: tuple[str, Pose, Sequence[str], Sequence[str]],
 ) -> Pose:
     image, pose, references, distrusted = job
+    data = query.read()
+    if data.sensors[data.record_of(image)[1]].params[:1] == (UNKNOWN_CAMERA,):
+        query = localized  # it has the camera that was estimated with the pose
     scene, camera = KaptureScene(mapping, query), query.read().camera_of(image)
     return apply_refiners(image, camera, pose, references, distrusted, refiners, scene)
 

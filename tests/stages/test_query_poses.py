@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,8 +19,9 @@ from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.dataset_tables import ImageGroup, SideTables
+from megloc_kapture.io.files import link_images
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
@@ -314,6 +316,23 @@ def test_rejected_refinements_keep_the_covariance(
     assert kept["moved"] == {}  # the refiner returns no covariance
     # the references are the candidates of the pose
     assert options.refiners[0].asked[first] == [min(world.map_poses)]
+
+
+def test_a_pose_is_refined_with_the_focal_length_that_was_estimated_with_it(
+    world: Any, tmp_path: Path
+) -> None:
+    first = min(world.query_poses)
+    data = world.query().read()
+    camera = data.camera_of(first)
+    unknown = Sensor("", "camera", ("UNKNOWN_CAMERA", str(camera.width), str(camera.height)))
+    query, result = tmp_path / "query", tmp_path / "localized"
+    write_sensors(query, replace(data, sensors=dict.fromkeys(data.sensors, unknown)))
+    link_images(world.query().root, query)
+    pose = Pose(world.query_poses[first], 50, 40, name=first, camera=camera)
+    write_localized(result, KaptureFolder(query), [pose])
+    folders = world.mapping(), KaptureFolder(query), KaptureFolder(result)
+    refine_poses(*folders, tmp_path / "out", Chosen(refiners=(Shift(),)))
+    assert status_table(tmp_path / "out").refinement[first] == "shift: accepted"
 
 
 def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_path: Path) -> None:
