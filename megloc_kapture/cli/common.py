@@ -243,7 +243,7 @@ class Computing:
     """Flags for the device and the precision of networks."""
 
     device: str | None = None
-    """Device of the networks: auto (a GPU if available), cpu, cuda, or cuda:N."""
+    """Device of the networks: auto (a GPU if available), cpu, cuda, or cuda:N. If omitted, auto."""
     precision: Literal["full", "half"] | None = None
     """Precision of the networks; half: float16 on a GPU, bfloat16 on a CPU. If omitted, full."""
 
@@ -267,7 +267,8 @@ class Choosing(Computing):
     """Flags that choose options."""
 
     preset: str | None = None
-    """Preset: classic, modern, modern-large, megloc."""
+    """Preset: classic, modern, modern-large, megloc. If omitted, classic; for megloc eval, that of
+    the benchmark file."""
     set: Texts = ()
     """Change an option: key.key=value; may be repeated."""
 

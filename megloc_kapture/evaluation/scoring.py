@@ -133,7 +133,7 @@ class Evaluation(Reported):
     estimated : ``cam_from_world`` of counted queries.
     without_truth : images or pairs without a true pose, sorted; reported but not counted.
     not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
-    truth_known_by : note on true poses that are not published; else empty.
+    truth_known_by : note on who has the true poses, if they are not published; else empty.
     pairs : name of a query -> its pair, for the MLAD challenges.
     nowhere : queries that show nothing of the map; recall ignores them, and any pose of theirs is
         wrong.
@@ -342,11 +342,12 @@ def evaluate_pairs(
     *,
     thresholds: Sequence[Threshold] | None = None,
 ) -> Evaluation:
-    """Evaluate by MLAD's metric: every pair counts once; each of several files is a condition.
+    """Evaluate by MLAD's metric: every pair counts once.
 
-    A pair has the name of its query; a query in several pairs is named "QUERY from REFERENCE,
-    FILE". Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the
-    relative translation; ``by_center`` has those of the camera centre.
+    If there are several files, each is a condition. A pair has the name of its query; a query in
+    several pairs is named "QUERY from REFERENCE, FILE". Poses are ``cam_from_world`` in one frame,
+    in metres. Position errors are those of the relative translation; ``by_center`` has those of the
+    camera centre.
     """
     pairs, estimated = benchmark.relocalization, result.by_pair
     if estimated is None:
@@ -354,14 +355,14 @@ def evaluate_pairs(
     absent = next((pair for pair in pairs if pair.reference not in references), None)
     if absent is not None:
         raise DataError(f"reference {absent.reference!r} of {absent.file!r} has no pose in the map")
-    times = Counter(pair.query for pair in pairs)
+    num_pairs = Counter(pair.query for pair in pairs)
     named = {
-        p.query if times[p.query] == 1 else f"{p.query} from {p.reference}, {p.file}": p
+        p.query if num_pairs[p.query] == 1 else f"{p.query} from {p.reference}, {p.file}": p
         for p in pairs
     }
     require(len(named) == len(pairs), "a pair of reference and query is listed twice in one file")
-    called = _conditions({pair.file for pair in pairs})
-    conditions = tuple(filter(None, dict.fromkeys(called[pair.file] for pair in pairs)))
+    condition_of = _conditions({pair.file for pair in pairs})
+    conditions = tuple(filter(None, dict.fromkeys(condition_of[pair.file] for pair in pairs)))
     by_center = evaluate_poses(
         replace(
             result,
@@ -373,7 +374,7 @@ def evaluate_pairs(
         {n: truth[p.query] for n, p in named.items() if p.query in truth},
         SideTables(
             protocol=benchmark.protocol.model_copy(update={"conditions": conditions, "pools": {}}),
-            groups={n: ImageGroup(condition=called[p.file]) for n, p in named.items()},
+            groups={n: ImageGroup(condition=condition_of[p.file]) for n, p in named.items()},
         ),
         thresholds=thresholds,
     )

@@ -131,7 +131,7 @@ def view_data(
     the upper left, upper right, lower right and lower left corner of the image; NaN without a pose.
     ``inliers`` (K, 3) are those of all queries, one after the other; ``drawn`` counts them per
     query. Frames of points, cameras and queries are indices into ``frames``, of which one is shown
-    at a time. ``radius`` is that of the content in view at first.
+    at a time. ``radius`` is that of the content initially in view.
     """
     notes = list[str]()
     rng = np.random.default_rng(_SEED)
@@ -162,7 +162,7 @@ def view_data(
         return None
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
-    page, _ = top_view(quats, centers)
+    axes, _ = top_view(quats, centers)
     # cameras and points separately, so that a thousand points do not outweigh ten cameras
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
@@ -182,7 +182,7 @@ def view_data(
     if any(len(xyz) > most for xyz in inliers):
         notes.append(f"At most {most} inliers per query are drawn.")
     inliers = [xyz[spread(len(xyz), most)] for xyz in inliers]
-    up = np.cross(*page)
+    up = np.cross(*axes)
     data = {
         "origin": origin.tolist(),
         "up": np.round(up, 9).tolist(),

@@ -144,7 +144,7 @@ def temporary_name() -> str:
 
 
 def clear_temporary(folder: Path, *, nested: bool = True) -> None:
-    """Remove unfinished files in (if ``nested``, also below) a folder with no other writer."""
+    """Remove unfinished files in a folder without another writer; if ``nested``, also below it."""
     find = folder.rglob if nested else folder.glob
     for path in list(find(f"{TEMPORARY}*")):
         remove(path)

@@ -109,7 +109,7 @@ def sampson_error_px(
 def in_front_of_both(rays_a: Floats, rays_b: Floats, b_from_a: RigidTransform) -> NDArray[np.bool_]:
     """Return a mask (N,) of matched rays that meet in front of both cameras or are parallel.
 
-    Rays that do not intersect meet where they are closest to each other.
+    Skew rays count as meeting at their closest points.
     """
     rotation = b_from_a.rotation_matrix()
     a = rays_a / np.linalg.norm(rays_a, axis=1, keepdims=True)
@@ -199,8 +199,8 @@ def two_view_of_variants(
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
 
     def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        # errors are in pixels at the originals' mean focal length; at the smaller mean with the
-        # variant's, a pixel is larger by this factor
+        # the threshold is meant for the mean focal length of the variant and the other image, but
+        # applied at that of the originals, which is larger by this factor
         coarser = (focal + other_focal) / (_precision(features.variant) * focal + other_focal)
         return verify_two_view(
             features.keypoints_px[matches[:, 0], :2],

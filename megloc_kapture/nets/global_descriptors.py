@@ -213,8 +213,8 @@ def apgem_from(
 
     ``whitening`` and ``power`` are those of :func:`whitening_from`; an empty name means none.
     """
-    beside = ("preprocess.", "model_options.", "pca.")
-    state = {key: value for key, value in tensors.items() if not key.startswith(beside)}
+    settings = ("preprocess.", "model_options.", "pca.")
+    state = {key: value for key, value in tensors.items() if not key.startswith(settings)}
     blocks = {key.split(".")[1] for key in state if key.startswith("layer3.")}
     depth = RESNET_DEPTHS.get(len(blocks))
     if depth is None or "adpool.p" not in state:

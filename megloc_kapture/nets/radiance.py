@@ -29,8 +29,8 @@ _RESOLUTIONS, _CHANNELS = (64, 128, 256), 12
 _GEOMETRY, _HIDDEN = 15, 64
 _POINT_FREQUENCIES, _DIRECTION_FREQUENCIES = 3, 2
 _APPEARANCE, _TRANSIENT = 8, 16
-# samples per ray: of the density pass in training, and in rendering, where more are needed because
-# trained surfaces are thin; samples over the whole ray; samples near the surface
+# samples per ray: density pass in training and in rendering (more, as trained surfaces are thin),
+# whole ray, near the surface
 _TRAINING_PASS, _RENDERING_PASS, _WHOLE_RAY, _NEAR_SURFACE = 32, 96, 8, 16
 _REACH = 1.25  # bound of the contracted coordinates; coordinates up to 1 are not contracted
 _MAX_LOG_DENSITY = 12.0
@@ -39,7 +39,7 @@ _AXES = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    # origins, directions: float32 (N, 3), in the field's frame; directions per unit of t
+    # origins, directions: float32 (N, 3), in the field's frame; a direction is the step for t = 1
     origins: torch.Tensor
     directions: torch.Tensor
     # near, far: t of a ray's ends
@@ -192,19 +192,19 @@ class NerfMlp(nn.Module):
         super().__init__()
         xyz = 3 + 6 * _NERF_POINT_FREQUENCIES
         for layer in range(_LAYERS):
-            entering = {0: xyz, _SKIP: _WIDTH + xyz}.get(layer, _WIDTH)
-            block = nn.Sequential(nn.Linear(entering, _WIDTH), nn.ReLU())
+            num_inputs = {0: xyz, _SKIP: _WIDTH + xyz}.get(layer, _WIDTH)
+            block = nn.Sequential(nn.Linear(num_inputs, _WIDTH), nn.ReLU())
             setattr(self, f"xyz_encoding_{layer + 1}", block)
         half = _WIDTH // 2
         self.xyz_encoding_final = nn.Linear(_WIDTH, _WIDTH)
-        entering = _WIDTH + 3 + 6 * _NERF_DIRECTION_FREQUENCIES + appearance_size
-        self.dir_encoding = nn.Sequential(nn.Linear(entering, half), nn.ReLU())
+        num_inputs = _WIDTH + 3 + 6 * _NERF_DIRECTION_FREQUENCIES + appearance_size
+        self.dir_encoding = nn.Sequential(nn.Linear(num_inputs, half), nn.ReLU())
         self.static_sigma = nn.Sequential(nn.Linear(_WIDTH, 1), nn.Softplus())
         self.static_rgb = nn.Sequential(nn.Linear(half, 3), nn.Sigmoid())
         if transient_size:
             layers: list[nn.Module] = []
-            for entering in (_WIDTH + transient_size, half, half, half):
-                layers += [nn.Linear(entering, half), nn.ReLU()]
+            for num_inputs in (_WIDTH + transient_size, half, half, half):
+                layers += [nn.Linear(num_inputs, half), nn.ReLU()]
             self.transient_encoding = nn.Sequential(*layers)
             self.transient_sigma = nn.Sequential(nn.Linear(half, 1), nn.Softplus())
             self.transient_rgb = nn.Sequential(nn.Linear(half, 3), nn.Sigmoid())
@@ -227,10 +227,10 @@ class NerfMlp(nn.Module):
             hidden = getattr(self, f"xyz_encoding_{layer + 1}")(hidden)
         sigma = self.static_sigma(hidden)[..., 0]
         final = self.xyz_encoding_final(hidden)
-        beside = [_repeated(frequencies(directions, _NERF_DIRECTION_FREQUENCIES), count)]
+        inputs = [final, _repeated(frequencies(directions, _NERF_DIRECTION_FREQUENCIES), count)]
         if appearance is not None:
-            beside.append(_repeated(appearance, count))
-        rgb = self.static_rgb(self.dir_encoding(torch.cat([final, *beside], dim=-1)))
+            inputs.append(_repeated(appearance, count))
+        rgb = self.static_rgb(self.dir_encoding(torch.cat(inputs, dim=-1)))
         if transient is None:
             return Samples(sigma, rgb)
         moving = self.transient_encoding(torch.cat([final, _repeated(transient, count)], dim=-1))
@@ -318,13 +318,13 @@ class TriPlane(nn.Module):
         deltas = spacings(t, rays)
         sigma, features = self.density(points)
         unit = nn.functional.normalize(rays.directions, dim=1)
-        beside = [frequencies(unit, _DIRECTION_FREQUENCIES), rays.light(self.appearance)]
-        seen = torch.cat([features, _repeated(torch.cat(beside, dim=1), count)], dim=-1)
-        rgb = torch.sigmoid(self.colour(seen))
+        per_ray = [frequencies(unit, _DIRECTION_FREQUENCIES), rays.light(self.appearance)]
+        inputs = torch.cat([features, _repeated(torch.cat(per_ray, dim=1), count)], dim=-1)
+        rgb = torch.sigmoid(self.colour(inputs))
         if rays.transient is None:
             return composite(t, deltas, Samples(sigma, rgb))
-        entering = frequencies(_contracted(points), _POINT_FREQUENCIES)
-        moving = self.moving(torch.cat([entering, _repeated(rays.transient, count)], dim=-1))
+        encoded = frequencies(_contracted(points), _POINT_FREQUENCIES)
+        moving = self.moving(torch.cat([encoded, _repeated(rays.transient, count)], dim=-1))
         moving_rgb = torch.sigmoid(moving[..., 1:4])
         moving_sigma = nn.functional.softplus(moving[..., 0] - 3.0)
         beta = nn.functional.softplus(moving[..., 4] - 1.0)
@@ -350,8 +350,8 @@ class TriPlane(nn.Module):
         return torch.sort(torch.cat([spread, near_surface], dim=1), dim=1).values
 
 
-def _mlp(entering: int, leaving: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(entering, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, leaving))
+def _mlp(num_inputs: int, num_outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(num_inputs, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, num_outputs))
 
 
 def _repeated(values: torch.Tensor, count: int) -> torch.Tensor:

@@ -284,9 +284,9 @@ def import_colmap(
 ) -> dict[str, float]:
     """Write a COLMAP reconstruction as a kapture map into an empty folder and return counts.
 
-    The unit is unknown unless given. A model of poses alone becomes a kapture folder of poses. A
-    model without points, or whose keypoints are not found again in its images, is mapped again
-    with its poses and the default preset.
+    The unit is unknown unless given. A model of poses alone becomes a kapture folder of poses. If
+    a model has no points, or too few of its keypoints are detected again in its images, these are
+    mapped again with the model's poses and the default preset.
     """
     read = ColmapReconstruction.read(source)
     if unit != METRES:

@@ -25,12 +25,12 @@ _SHUTDOWN_S = 60  # running requests may finish within this time; slow uploads a
 
 
 def prepared_localizer(kapture_map: KaptureMap, options: PipelineOptions) -> Localizer:
-    """Return a localizer with loaded networks; missing files raise their error here."""
+    """Return a localizer with loaded networks, so that missing files are reported at once."""
     localizer = Localizer(kapture_map, options=options)
     kapture_map.check()
     for local in localizer.types:
         _ = local.extractor
-    # noise matches nothing, but its localization loads every network
+    # noise gets no pose, but loads the networks of features, retrieval and matching
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
     with single_threaded():
         localizer.localize(noise, Camera.pinhole(320, 240, 300.0))
@@ -77,20 +77,20 @@ def map_overview(kapture_map: KaptureMap) -> bytes:
     quats, translations = stack_poses([kapture_map.poses[name] for name in names])
     centers = camera_centers(quats, translations)
     origin = centers.mean(axis=0)
-    page, _ = top_view(quats, centers)
+    axes, _ = top_view(quats, centers)
     forward = rotate(invert_quats(quats), np.array([0.0, 0.0, 1.0]))
-    cameras = np.hstack([(centers - origin) @ page.T, forward @ page.T])
+    cameras = np.hstack([(centers - origin) @ axes.T, forward @ axes.T])
     points = _without_outliers(
         np.concatenate([k.index.xyz for k in kapture_map.keypoints.values()])
     )
     content = {
         "images": len(names),
         "unit": kapture_map.unit,
-        "right": _rounded(page[0], 9),
-        "up": _rounded(page[1], 9),
+        "right": _rounded(axes[0], 9),
+        "up": _rounded(axes[1], 9),
         "origin": origin.tolist(),
         "cameras": _rounded(cameras[:: 1 + len(cameras) // _MAX_CAMERAS]),
-        "points": _rounded((points[:: 1 + len(points) // _MAX_POINTS] - origin) @ page.T),
+        "points": _rounded((points[:: 1 + len(points) // _MAX_POINTS] - origin) @ axes.T),
     }
     return json.dumps(content, separators=(",", ":")).encode()
 

@@ -93,7 +93,7 @@ class PoseRefinementOptions(Options):
 def judge_consistency(
     frame: str, method: str, displacements: Iterable[Mapping[str, float] | None]
 ) -> ConsistencyRow:
-    """Judge a map by at most ``MAX_TESTED`` displacements (DISPLACEMENT) of held-out images."""
+    """Judge a map by up to ``MAX_TESTED`` displacements of held-out images, see DISPLACEMENT."""
     known: list[Mapping[str, float]] = []
     for each in displacements:
         if each is not None:

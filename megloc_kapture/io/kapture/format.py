@@ -65,7 +65,7 @@ class Sensor:
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
 
-    The dicts may be changed, but once poses have been requested, ``rigs`` may only be added to.
+    The dicts may be changed, but once poses have been requested, ``rigs`` may only get new rigs.
 
     Attributes
     ----------
