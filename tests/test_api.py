@@ -79,7 +79,7 @@ def test_results_are_evaluated_as_they_are(
     assert "recall (%)" in str(result) and result.row().recall[0].recall == 1.0
     pairs = megloc.evaluate(results, truth=scene / "query_gt", thresholds=[(0.05, 5), (9, 9)])
     assert [str(each.threshold) for each in pairs.row().recall] == ["0.05 m, 5 deg", "9 m, 9 deg"]
-    with pytest.raises(megloc.OptionError, match="'-1, 5' is not METRES,DEGREES"):
+    with pytest.raises(megloc.OptionError, match="'-1, 5' is not METRES,DEGREES or METRES"):
         megloc.evaluate(results, truth=scene / "query_gt", thresholds=[(-1, 5)])
     results.save(tmp_path / "saved")
     again = megloc.evaluate(tmp_path / "saved", truth=scene / "query_gt")

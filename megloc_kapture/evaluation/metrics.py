@@ -48,7 +48,7 @@ class Threshold(Options):
             return cls(position_m=numbers[0], angle_deg=numbers[1] if len(numbers) == 2 else None)
         except ValueError as error:  # pydantic's errors are ValueErrors too
             raise OptionError(
-                f"threshold {text!r} is not METRES,DEGREES (both at or above 0), such as 0.25,2"
+                f"threshold {text!r} is not METRES,DEGREES or METRES, at or above 0, such as 0.25,2"
             ) from error
 
     def holds(self, position_m: ArrayLike, angle_deg: ArrayLike) -> NDArray[np.bool_]:

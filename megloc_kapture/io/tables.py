@@ -226,9 +226,10 @@ def write_refinement(path: Path, results: Iterable[LocalizationResult]) -> None:
 class ConsistencyRow:
     """One row of ``map_consistency.csv``: a refiner's check of one coordinate frame of a map.
 
-    ``moved_m`` to ``squared_distance`` are medians over the tested images, NaN without such images;
-    see ``megloc_kapture.refinement.references.DISPLACEMENT``. ``reason`` says why query poses are
-    not refined; it is empty if they are.
+    ``images`` is the number of held-out map images that were refined; ``contradicting`` of them
+    moved by more than their uncertainty. ``moved_m`` to ``squared_distance`` are medians over these
+    images, NaN without any; see ``megloc_kapture.refinement.references.DISPLACEMENT``. ``reason``
+    says why query poses are not refined; it is empty if they are.
     """
 
     frame: str
@@ -260,8 +261,9 @@ def _rounded(row: object) -> list[object]:
 class DepthRow:
     """One row of ``reconstruction/depth.csv``: stereo depth of a map image.
 
-    ``sources`` are the images that the map image was compared with, best first. ``fill`` is the
-    fraction of pixels with depth.
+    ``sources`` are the images that the map image was compared with, best first; ``near_m`` and
+    ``far_m`` limit the depths that were tried. ``fill`` is the fraction of pixels with depth.
+    ``reason`` says why there is no depth, if so.
     """
 
     image: str

@@ -87,7 +87,7 @@ def cluster_by_shared_points(
 ) -> NDArray[np.int64]:
     """Cluster images by shared points (N, N); labels (N,) in order of first members.
 
-    If no two images share a point (all points come from depth images), all are one cluster.
+    If no two images share a point, as when all points come from depth, all are one cluster.
     """
     apart = shared - np.diag(np.diag(shared))
     if not apart.any():
@@ -154,9 +154,9 @@ def localize_in_clusters(
 ) -> tuple[Pose | Failure, PoseProblem | None]:
     """Estimate one pose per cluster of candidate images and refine the best.
 
-    Clusters whose poses explain each other's inliers are merged first: images that look in
-    different directions share no points but may show the same location. For a rig, the pose is
-    ``rig_from_world`` and the inlier mask runs over views, then keypoints types.
+    Two clusters are merged first if the pose of one explains the inliers of the other: images that
+    look in different directions share no points but may show the same location. For a rig, the pose
+    is ``rig_from_world`` and the inlier mask runs over views, then keypoints types.
 
     Parameters
     ----------
@@ -164,7 +164,8 @@ def localize_in_clusters(
     frames : coordinate frame of each cluster; clusters of different frames are not merged.
     centers : camera centres (3,) of the map images; needed for ``min_confidence``.
     min_confidence : poses of lower confidence fail; None computes no confidence.
-    scene : reader of the images that are compared if the residuals of a pose are unusually large.
+    scene : reader of query and map images, whose pixels are compared if the residuals of a pose are
+        unusually large.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])

@@ -31,7 +31,7 @@ PairOptions = TypeVar("PairOptions", bound=NetworkOptions)
 
 class PairNetwork(Checkpointed[PairOptions], ABC):
     def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
-        """Match two images; return rows of keypoints int64 (K, 2), and scores (K,).
+        """Match two images; return indices of keypoints, int64 (K, 2), and scores (K,).
 
         A keypoint has at most one match; matches are sorted by the first column.
         """

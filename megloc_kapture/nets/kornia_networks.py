@@ -44,13 +44,16 @@ def load_xfeat(tensors: Tensors, where: str) -> nn.Module:
     return network.eval()
 
 
-def xfeat_descriptors(network: Any, images: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
-    """Return unit-norm descriptors (N, 64) at kornia's keypoints (N, 2) in image (1, 3, H, W)."""
-    resized, *ratio_yx = network._preprocess_tensor(images)
+def xfeat_descriptors(network: Any, image: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
+    """Return unit-norm descriptors (N, 64) of an image (1, 3, H, W).
+
+    ``xy`` (N, 2) are keypoints of kornia's XFeat, in its pixel coordinates.
+    """
+    resized, *ratio_yx = network._preprocess_tensor(image)
     dense = functional.normalize(network.net(resized)[0], dim=1)
-    places = xy / xy.new_tensor(ratio_yx[::-1])
+    resized_xy = xy / xy.new_tensor(ratio_yx[::-1])
     height, width = resized.shape[-2:]
-    sampled = network.interpolator(dense, places[None], H=height, W=width)[0]
+    sampled = network.interpolator(dense, resized_xy[None], H=height, W=width)[0]
     return functional.normalize(sampled, dim=-1)
 
 

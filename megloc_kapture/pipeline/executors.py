@@ -1,4 +1,4 @@
-"""Executors of per-image and per-pair work: inline, local processes, or dask."""
+"""Executors for per-image and per-pair work: inline, local processes, or dask."""
 
 from __future__ import annotations
 
@@ -133,8 +133,8 @@ def _process_pool(count: int) -> Iterator[Executor]:
         _kill(pool)
         if isinstance(error, BrokenProcessPool):
             raise MeglocError(
-                "a worker process died: out of memory (try fewer workers, --workers), or a script "
-                'whose code is not below `if __name__ == "__main__":`'
+                "a worker process died: either memory ran out (try fewer workers, --workers), or "
+                'your script is not guarded by `if __name__ == "__main__":`'
             ) from error
         raise
     finally:

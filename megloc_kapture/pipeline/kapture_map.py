@@ -95,8 +95,8 @@ class KaptureMap:
     """Read-only map with 3D points, observations and keypoints; see :meth:`open`.
 
     All coordinates are in COLMAP's convention. ``keypoints`` are the types used for localization.
-    ``tables`` have the coordinate frames of map images and the priors of queries, if the map is in
-    a workspace.
+    ``tables`` have the coordinate frames of map images and the priors of queries; they are empty
+    unless the map or its parent folder has tables.
     """
 
     folder: KaptureFolder
@@ -241,7 +241,10 @@ def plain_name(local_type: str) -> str:
 
 
 def _extractor_named(name: str) -> PluginChoice | None:
-    """Return the plugin named by a type or its weights, ignoring a trailing number (r2d2_500)."""
+    """Return the plugin with the type's name, or with weights of that name.
+
+    A trailing number (r2d2_500) is ignored.
+    """
     plugins = {plain_name(plugin): plugin for plugin in plugin_names(LOCAL_FEATURES)}
     weights = {plain_name(key): key for key in registry()}
     for plain in (plain_name(name), plain_name(re.sub(r"[-_ ]\d+k?$", "", name))):
@@ -290,7 +293,7 @@ def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dic
     origins = {}
     for name, origin in origin_of.items():
         if origin.intrinsics != intrinsics:
-            # only the difference is estimated, so equal origins stay equal
+            # only the offset between keypoints and intrinsics is measured: equal origins stay equal
             agree = origin.keypoints == origin.intrinsics
             keypoints = intrinsics if agree else origin.keypoints
             reason = f"{origin.reason}; intrinsics from {most}: {intrinsics}"

@@ -168,7 +168,7 @@ class Manifest(Options):
     stage: str
     version: int
     options: dict[str, Any]
-    inputs: dict[str, str] = Field(description="inputs: name to fingerprint")
+    inputs: dict[str, str] = Field(description="fingerprints of the inputs by name")
     fingerprint: str
     output: str = Field(description="fingerprint for stages that read the outputs")
     outputs: tuple[str, ...]
@@ -249,7 +249,7 @@ def run_plan(
     reports = []
     for number, stage in enumerate(stages[:stop]):
         inputs = {name: marks[name] for name in _before(stages, stage)}
-        inputs |= _there(stages, stage, workspace) | dict(stage.external()) | stage.code()
+        inputs |= _earlier_inputs(stages, stage, workspace) | dict(stage.external()) | stage.code()
         made = workspace.manifest(stage.name)
         planned = _planned(stage, inputs)
         why = asked.get(stage.name) or _why(stage, planned, made, workspace)
@@ -327,8 +327,8 @@ def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
     ]
 
 
-def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[str, str]:
-    """Return, by stage, fingerprints of inputs from earlier runs that no planned stage writes."""
+def _earlier_inputs(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[str, str]:
+    """Return fingerprints, by stage, of the inputs that only stages of earlier runs wrote."""
     written = [path for other in stages for path in other.writes]
     missing = [path for path in stage.reads if not any(is_below(path, other) for other in written)]
     if not missing:
@@ -391,7 +391,7 @@ def _run(
         resumed = replace(work, resume=stage.resumes, placement=stage.placement)
         counts = dict(stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder)))
         clear_temporary(folder)
-        # without a manifest a stage killed below this line runs again
+        # if killed below this line, the stage has no manifest and runs again
         workspace.manifest_path(stage.name).unlink(missing_ok=True)
         _take_over(stage, workspace)
         written = tuple(o for o in stage.writes if (folder / o).exists())

@@ -121,8 +121,8 @@ def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
 class UnchangingRegion:
     """Static region below a frontier across the image; an empty region is falsy and has a reason.
 
-    The frontier has one value per column (columns have equal widths): its distance from the top as
-    a share of the height, 1 in columns without a region.
+    The frontier has one value for each of N equally wide columns of the image: its distance from
+    the top as a share of the height, 1 in columns without a region.
     """
 
     frontier: tuple[float, ...]

@@ -110,7 +110,7 @@ class StageWork(Work):
 
 
 CODE_OF = "code of "
-ROOT = "root"  # name of the imported folder among the inputs of an import
+ROOT = "root"  # key of the dataset's folder in the inputs of an import stage
 PROTOCOL = "protocol"
 
 
@@ -125,7 +125,7 @@ class Stage(ABC):
     ----------
     version : increase it when the output changes for the same options and inputs.
     resumes : the output of an interrupted run is kept, and the items in it are skipped.
-    reads, writes : paths in the workspace; a folder includes its contents.
+    reads, writes : paths in the workspace; a written folder includes its contents.
     root : folder of user data that the stage imports, or None; a workspace has one root.
     placement : device and precision of the stage's networks; ``run`` gets it in ``work``.
     """

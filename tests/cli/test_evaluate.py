@@ -77,8 +77,8 @@ def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path, tmp_pa
     assert done.status == 0
     flat = " ".join(done.out.split())
     assert (
-        "At 0.25 m, 2 deg a localizes 12 queries that b misses and b localizes none that a misses: "
-        "the difference is real (p = 0.0015)."
+        "At 0.25 m, 2 deg, a localizes 12 queries that b misses and b localizes none that a "
+        "misses: the difference is real (p = 0.0015)."
     ) in flat  # 2 * 0.5^12, times the three thresholds
     comparison = json.loads((out / "recall.json").read_text())["comparison"]
     assert comparison["tests"][0]["only_first"] == sorted(IMAGES[2:14])

@@ -64,7 +64,7 @@ def test_confidence_of_a_result() -> None:
     assert evaluation.row().num_queries == 4 and evaluation.without_truth == ()
     text = " ".join(report_text(evaluation).split())
     assert "2 queries show nothing of the map: 1 not localized, 1 localized wrongly" in text
-    assert "2 of 4 poses with a confidence are wrong" in text
+    assert "4 poses with a confidence, 2 of them wrong" in text
     assert evaluation.to_pandas().loc["a", "confidence"] == 0.9
     # a result without confidences says nothing of them
     evaluation = evaluate_poses(

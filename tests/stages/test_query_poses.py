@@ -382,7 +382,7 @@ def test_each_coordinate_frame_has_its_consistency(folders: Any, tmp_path: Path)
     bad, good = read_consistency(out / CONSISTENCY_FILE)
     assert (bad.frame, bad.images, bad.contradicting) == ("bad", 6, 6)
     assert (good.frame, good.contradicting, good.reason) == ("good", 0, "")
-    assert consistency_sentence(good).startswith("sure in good is used; 6 map images held out")
+    assert consistency_sentence(good).startswith("sure in good is used; 6 held-out map images")
     # without the check the refiner is used everywhere
     options = Chosen(refiners=(Sure(require_consistent_map=False),))
     counts = refine_poses(*folders, tmp_path / "all", options, tables=TABLES)

@@ -134,8 +134,8 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
         share = format_percent(confidence.num_wrong / confidence.num_poses)
         interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
         sentences.append(
-            f"{confidence.num_wrong} of {counted(confidence.num_poses, 'pose')} with a confidence "
-            f"are wrong (beyond {coarsest}): {share} % ({interval})"
+            f"{counted(confidence.num_poses, 'pose')} with a confidence, {confidence.num_wrong} of "
+            f"them wrong (beyond {coarsest}): {share} % ({interval})"
         )
     if confidence.num_wrong:
         by_inliers = confidence.area_by_inliers
@@ -158,7 +158,7 @@ def consistency_sentence(row: ConsistencyRow) -> str:
     if row.reason:
         return f"{row.method}{frame} is not used: {row.reason}"
     return (
-        f"{row.method}{frame} is used; {row.images} map images held out move by "
+        f"{row.method}{frame} is used; {row.images} held-out map images move by "
         f"{format_movement(row.moved_m, row.turned_deg)}, {row.moved_px:.1f} px (medians; "
         f"estimated accuracy {format_movement(row.claimed_m, row.claimed_deg)})"
     )
@@ -180,7 +180,7 @@ def agreement_sentence(row: AgreementRow, results: WithoutTruth) -> str:
 
 def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
     first, second = labels[test.first], labels[test.second]
-    where = f"At {test.threshold}"
+    where = f"At {test.threshold},"
     only_first, only_second = len(test.only_first), len(test.only_second)
     if not only_first and not only_second:
         if not test.both:
