@@ -375,11 +375,11 @@ def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         differences: list[str] = []
         for key in sorted(set(old) | set(new)):
-            differences += _differences(
-                old.get(key), new.get(key), f"{prefix}.{key}" if prefix else key
-            )
+            name = f"{prefix}.{key}" if prefix else key
+            differences += _differences(old.get(key, "absent"), new.get(key, "absent"), name)
         return differences
-    return [] if old == new else [prefix]
+    # as in fingerprints, in which 1 and 1.0 differ
+    return [] if json.dumps(old, sort_keys=True) == json.dumps(new, sort_keys=True) else [prefix]
 
 
 def _run(

@@ -131,6 +131,10 @@ CHANGES: dict[str, tuple[Callable[[Plan], Any], list[str]]] = {
         lambda plan: plan.options["a"].update(deep={"x": 2, "y": [(0.5, None)]}, new=1),
         ["options changed: deep.x, new", "a changed", "a changed"],
     ),
+    "values that are equal in Python, but not in JSON": (
+        lambda plan: plan.options["a"].update(deep={"x": 1.0, "y": [(0.5, None)]}, new=None),
+        ["options changed: deep.x, new", "a changed", "a changed"],
+    ),
     "an input": (
         lambda plan: plan.external.update(data="2"),
         ["data changed", "a changed", "a changed"],
