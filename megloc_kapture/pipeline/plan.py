@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal
 
@@ -389,7 +390,9 @@ def _run(
     clock = time.perf_counter()
     with workspace.staging(stage.name, planned.fingerprint, resumes=stage.resumes) as folder:
         resumed = replace(work, resume=stage.resumes, placement=stage.placement)
-        counts = dict(stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder)))
+        counted = stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder))
+        # plugins may count with numpy
+        counts = {n: int(v) if isinstance(v, Integral) else float(v) for n, v in counted.items()}
         clear_temporary(folder)
         # if killed below this line, the stage has no manifest and runs again
         workspace.manifest_path(stage.name).unlink(missing_ok=True)

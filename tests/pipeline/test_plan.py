@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
@@ -167,6 +168,15 @@ def test_changed_stages_run_again(
     assert plan.result() == f"ab{plan.options['b'].get('extra', '')}c"
     plan.options["a"] = dict(reversed(plan.options["a"].items()))  # the order does not count
     assert all_kept(plan.run())
+
+
+def test_counts_may_be_numpy_numbers(tmp_path: Path) -> None:
+    counts: dict[str, Any] = {"letters": np.int64(2000), "mean_px": np.float32(0.5)}
+    stages = [Step("a", (), (), lambda out: counts)]
+    workspace = Workspace(tmp_path / "w")
+    (report,) = run_plan(stages, workspace)
+    assert describe(report).startswith("a: 2,000 letters, mean: 0.5 px; ")
+    assert all_kept(run_plan(stages, workspace))
 
 
 def test_an_output_of_another_stage_under_other_options_is_made_again(tmp_path: Path) -> None:
