@@ -244,7 +244,13 @@ def evaluate_poses(
         counted,
         "no query with a true pose counts in this benchmark: is this the right ground truth?",
     )
-    thresholds = tuple(thresholds or thresholds_from_pairs(benchmark.protocol.thresholds))
+    # from fine to coarse: confidences and colours of queries depend on the order
+    thresholds = tuple(
+        sorted(
+            thresholds or thresholds_from_pairs(benchmark.protocol.thresholds),
+            key=lambda t: (t.position_m, np.inf if t.angle_deg is None else t.angle_deg),
+        )
+    )
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
     queries = tuple(

@@ -15,6 +15,7 @@ from megloc_kapture.evaluation.evaluate import evaluate_results
 from megloc_kapture.evaluation.metrics import thresholds_from_pairs
 from megloc_kapture.evaluation.pose_files import format_mlad_file, relative_pose
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.queries import shown_queries
 from megloc_kapture.evaluation.report.reports import plain, report_data, report_text
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import evaluate_pairs
@@ -109,6 +110,21 @@ def test_results_without_scored_queries_are_refused() -> None:
     for truth, options in (({}, {}), ({"a": HERE}, {"scored": set()})):
         with pytest.raises(DataError, match="no query with a true pose"):
             evaluate_poses({"a": HERE}, truth, **options)
+
+
+def test_the_coarsest_threshold_need_not_be_given_last() -> None:
+    thresholds = thresholds_from_pairs(((5.0, 10.0), (0.25, 2.0), (0.25, None)))
+    statuses = {name: LocalizationResult(name=name, confidence=0.9) for name in "ab"}
+    result = evaluate_poses(
+        {"a": pose_at([1.0, 0.0, 0.0]), "b": pose_at([0.1, 0.0, 0.0])},
+        dict.fromkeys("ab", HERE),
+        thresholds=thresholds,
+        statuses=statuses,
+    )
+    assert result.confidence is not None and result.confidence.num_wrong == 0
+    meanings = [query.meaning for query in shown_queries(result)]
+    assert meanings == ["within 5 m, 10 deg", "within 0.25 m, 2 deg"]
+    assert [str(t) for t in result.thresholds] == ["0.25 m, 2 deg", "0.25 m", "5 m, 10 deg"]
 
 
 THRESHOLDS = thresholds_from_pairs(((0.1, None), (0.2, None), (0.5, None)))
