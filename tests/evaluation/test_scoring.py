@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from megloc_kapture.evaluation.evaluate import evaluate_results
 from megloc_kapture.evaluation.metrics import thresholds_from_pairs
 from megloc_kapture.evaluation.pose_files import format_mlad_file, relative_pose
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.content import criterion
 from megloc_kapture.evaluation.report.queries import shown_queries
 from megloc_kapture.evaluation.report.reports import plain, report_data, report_text
 from megloc_kapture.evaluation.results import Result
@@ -196,6 +198,9 @@ def test_mlad_pairs_and_conditions() -> None:
     assert actual.queries[-1].reason == "dark"
     assert actual.without_truth == ("unknown.png",)
     assert actual.by_center.row().num_queries == 4
+    assert criterion(actual).startswith("Error of the translation relative to the given reference")
+    with_angles = replace(actual, thresholds=thresholds_from_pairs(((0.1, 2.0),)))
+    assert criterion(with_angles).startswith("Errors of the rotation and of the translation")
 
 
 def test_pose_files_and_folders_have_equal_figures(tmp_path: Path) -> None:

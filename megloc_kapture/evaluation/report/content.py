@@ -81,7 +81,8 @@ def criterion(evaluation: Evaluation) -> str:
     with_angles = any(threshold.angle_deg is not None for threshold in evaluation.thresholds)
     errors = "Both errors" if with_angles else "Position error"
     if evaluation.by_center is not None:
-        errors = "Error of the translation relative to the given reference"
+        errors = "Errors of the rotation and" if with_angles else "Error"
+        errors += " of the translation relative to the given reference"
     return f"{errors} at or below (<=) the threshold; a query without a pose counts as a miss."
 
 
