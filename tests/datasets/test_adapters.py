@@ -12,7 +12,7 @@ from fourseasons_files import DAY, SNOW, B, image, write_two_recordings
 from inloc_files import write_download
 from robotcar_files import ts, write_layout
 
-from megloc_kapture.datasets.official import write_official
+from megloc_kapture.datasets.official import Count, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import load_plugin
@@ -123,3 +123,12 @@ def test_missing_files_are_refused_or_skipped_on_request(
     mapping.validate(deep=True)
     assert len(mapping.read().records_camera) == map_images
     assert len(query.read().records_camera) == queries
+
+
+def test_counts_are_compared_with_the_published_ones() -> None:
+    lines = [str(Count("images", 3, published)) for published in (None, 3, 5)]
+    assert [line.split(maxsplit=2)[2:] for line in lines] == [
+        [],
+        ["as published"],
+        ["published: 5, -2"],
+    ]
