@@ -464,7 +464,7 @@ class _Rematching(PipelineStage):
     version = 4
     matches: ClassVar[str]
     of_queries: ClassVar[bool]
-    explained_by = (
+    explained_by: ClassVar[tuple[str, ...]] = (
         "second_matching.matcher",
         "second_matching.min_matches",
         "guided_pyramid.mode",
