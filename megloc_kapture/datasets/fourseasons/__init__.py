@@ -149,7 +149,7 @@ GNSS_POSES, POSES, TRANSFORMATIONS = "GNSSPoses.txt", "poses.txt", "Transformati
 
 _IMAGES = "undistorted_images"
 _MARKS = (_IMAGES, GNSS_POSES, POSES, "times.txt")
-_RELOCALIZATION_FOLDERS = (".", "RelocalizationFiles*", "*", "*/RelocalizationFiles*")
+_RELOCALIZATION_FOLDERS = (".", "*", "*/RelocalizationFiles*")
 # number of pairs by (source, target), from the challenges' pages
 PUBLISHED_PAIRS = {
     ("recording_2020-10-08_09-57-28", "recording_2021-01-07_14-03-57"): 227,

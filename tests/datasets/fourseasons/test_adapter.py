@@ -153,6 +153,7 @@ def many_keyframes(root: Path, count: int) -> list[int]:
     ("day", "snow", "name"),
     [
         (DAY, SNOW, f"relocalizationFile_{DAY}_to_{SNOW}.txt"),
+        (DAY, SNOW, f"RelocalizationFilesTest/relocalizationFile_{DAY}_to_{SNOW}.txt"),
         ("loop_2_train", "loop_2_test", "reloc_loop_2_train_to_loop_2_test.txt"),
         (DAY, SNOW, f"{DAY}/RelocalizationFilesTest/relocalizationFile_{SNOW}_hard.txt"),
     ],
