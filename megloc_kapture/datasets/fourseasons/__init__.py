@@ -287,7 +287,7 @@ def select(
     if not targets:
         targets = sorted({f.target for f in files if f.source in sources} - set(sources))
     if not targets:
-        targets = [name for name in recordings if name not in sources]
+        targets = [name for name in recordings if name not in sources] or [ANOTHER_RECORDING]
     missing.files += [root / name for name in (*sources, *targets) if name not in recordings]
     sources, targets = ([n for n in names if n in recordings] for names in (sources, targets))
     require(
@@ -296,8 +296,6 @@ def select(
         "(GNSSPoses.txt or poses.txt) and another one for the queries are needed",
         path=root,
     )
-    if not targets:
-        missing.files.append(root / ANOTHER_RECORDING)
     return Selection(
         recordings,
         [recordings[name] for name in sources],
