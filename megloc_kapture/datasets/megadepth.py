@@ -98,7 +98,7 @@ def _images(root: Path, scene: str) -> Iterator[_Image]:
     elif table.is_file():
         yield from _of_table(root, scene, table)
     else:
-        raise DataError(f"neither {folder} nor {table} exists", path=root)
+        raise DataError(f"no {' or '.join(_MODELS)} in {folder}, and no {table}", path=root)
 
 
 def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Image]:
