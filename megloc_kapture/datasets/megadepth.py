@@ -50,8 +50,8 @@ class MegaDepthOptions(Options):
     )
 
 
-# files of image and depth, camera, and ``cam_from_world``
-_Image = tuple[Path, Path, Camera, RigidTransform]
+# image file, depth file if any, camera and ``cam_from_world``
+_Image = tuple[Path, Path | None, Camera, RigidTransform]
 
 
 def import_megadepth(
@@ -105,8 +105,8 @@ def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Im
     reconstruction = read_colmap_model(model, with_points=False)
     for image in sorted(reconstruction.images, key=lambda image: image.name):
         path = safe_join(folder, image.name)
-        depth = _depth_of(root, scene, image.name)
-        if path.is_file() and depth is not None:
+        if path.is_file():
+            depth = _depth_of(root, scene, image.name)
             yield path, depth, reconstruction.cameras[image.camera_id], image.cam_from_world
 
 
@@ -122,9 +122,9 @@ def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
         images, intrinsics, poses = (file[name] for name in _ARRAYS)
     for row in np.argsort(images):
         path = safe_join(root, str(images[row]))
-        depth = _depth_of(root, scene, path.name)
-        if not path.is_file() or depth is None:
+        if not path.is_file():
             continue
+        depth = _depth_of(root, scene, path.name)
         k = intrinsics[row]
         camera = Camera("PINHOLE", *image_size(path), (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
         pose = poses[row]
@@ -134,7 +134,7 @@ def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
 def _write_scene(output: Path, images: Sequence[_Image] | Iterator[_Image]) -> int:
     data, links = KaptureData(), {}
     for number, (path, depth, camera, cam_from_world) in enumerate(images):
-        depth_m = read_megadepth_depth(depth)
+        depth_m = None if depth is None else read_megadepth_depth(depth)
         if depth_m is None:
             continue
         name = f"images/{path.name}"

@@ -33,7 +33,7 @@ def write_depth(path: Path, depth: Any) -> None:
 
 
 def write_sample(root: Path, scene: str, *, model: bool) -> None:
-    """Write four images, one with relative depth, and the poses of a missing one."""
+    """Write images: four with depth, one with relative depth, one without; one is missing."""
     images = root / "Undistorted_SfM" / scene / "images"
     depths = root / DEPTHS / scene / "dense0" / "depths"
     for name, pose in POSES.items():
@@ -42,7 +42,9 @@ def write_sample(root: Path, scene: str, *, model: bool) -> None:
     write_image(images / "relative.jpg", render(POSES["0_o.jpg"]))
     relative = np.where(np.arange(400) < 200, -1.0, 1.0) * np.ones((300, 1))
     write_depth(depths / "relative.h5", relative)
-    everything = {**POSES, "relative.jpg": POSES["0_o.jpg"], "absent.jpg": POSES["0_o.jpg"]}
+    write_image(images / "flat.jpg", render(POSES["0_o.jpg"]))
+    others = ("relative.jpg", "flat.jpg", "absent.jpg")
+    everything = POSES | dict.fromkeys(others, POSES["0_o.jpg"])
     if model:
         lines = []
         for number, (name, pose) in enumerate(everything.items(), start=1):
@@ -71,7 +73,7 @@ def write_sample(root: Path, scene: str, *, model: bool) -> None:
     for key, values in arrays.items():
         as_published[key] = np.empty(len(values), object)
         as_published[key][:] = values
-    np.savez(root / "scene_info" / f"{scene}.npz", **as_published, overlap_matrix=np.eye(6))
+    np.savez(root / "scene_info" / f"{scene}.npz", **as_published, overlap_matrix=np.eye(7))
 
 
 def check(folder: Path) -> None:
@@ -101,7 +103,7 @@ def test_a_scene_is_imported_by_its_undistorted_model(tmp_path: Path, capsys: An
         main(["import", "megadepth", str(tmp_path / "root"), "-o", str(tmp_path / "out")])
     assert end.value.code == 0, capsys.readouterr().err
     printed = " ".join(capsys.readouterr().out.split())
-    assert printed == "scene 1 images 4 without depth 1"
+    assert printed == "scene 1 images 4 without depth 2"
     check(tmp_path / "out" / "0015")
 
 
@@ -118,7 +120,7 @@ def test_a_scene_is_imported_by_its_table_of_plain_arrays(tmp_path: Path) -> Non
     script.write_text(lines.replace("TABLE", repr(str(table))))
     subprocess.run([sys.executable, script], check=True)
     counts = import_megadepth(root, tmp_path / "out", ("0015",))
-    assert counts == {"scenes": 1, "images": 4, "without_depth": 1}
+    assert counts == {"scenes": 1, "images": 4, "without_depth": 2}
     check(tmp_path / "out" / "0015")
 
 
