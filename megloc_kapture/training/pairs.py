@@ -126,7 +126,11 @@ class PosedPairs:
     def _read_overlaps(self, path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         row_of = {name: row for row, name in enumerate(self._names)}
         pairs = read_pairs(path)
-        rows = [(row_of[pair.query], row_of[pair.map]) for pair in pairs]
+        try:
+            rows = [(row_of[pair.query], row_of[pair.map]) for pair in pairs]
+        except KeyError as error:
+            message = f"image {error} has no pose and depth in {self.folder}; -f starts over"
+            raise DataError(message, path=path) from error
         near = np.array(rows, np.int64).reshape(-1, 2)
         return near, np.array([pair.score for pair in pairs], np.float64)
 

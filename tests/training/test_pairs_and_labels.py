@@ -55,7 +55,7 @@ def test_pairs_are_drawn_from_overlap_bins(walk: Path, monkeypatch: pytest.Monke
     assert baselines[0.3] > baselines[0.5] + 0.4
 
 
-def test_measured_overlaps_are_read_again(walk: Path, tmp_path: Path) -> None:
+def test_measured_overlaps_are_read_again(walk: Path, other_walk: Path, tmp_path: Path) -> None:
     path = tmp_path / "overlaps" / "0.txt"
     source = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
     pairs = read_pairs(path)
@@ -64,6 +64,8 @@ def test_measured_overlaps_are_read_again(walk: Path, tmp_path: Path) -> None:
     write_pairs(path, [replace(p, score=0.99) for p in pairs[1:]] + [replace(pairs[0], score=0.2)])
     again = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
     assert again.counts()["pairs"] == 1 < source.counts()["pairs"]
+    with pytest.raises(DataError, match=r"0\.txt: image '0\.png' has no pose and depth in .*; -f"):
+        PosedPairs(KaptureFolder(other_walk), SMALL, measured=path)
 
 
 def test_pairs_have_reduced_images_and_geometry(walk: Path) -> None:
