@@ -65,6 +65,10 @@ Changes = Mapping[str, Any]
 Files = list[str] | list[Path] | tuple[Path | str, ...]
 
 
+def _as_tuple(given: Any) -> tuple[Any, ...]:
+    return (given,) if isinstance(given, str | Path) else tuple(given)
+
+
 class Map:
     """A kapture map with its localization options. The map is read-only.
 
@@ -85,7 +89,7 @@ class Map:
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
         """Return the localizer that :meth:`localize` uses with these pose refiners; cached."""
-        refiners = (refine,) if isinstance(refine, str) else tuple(refine)
+        refiners = _as_tuple(refine)
         if refiners not in self._localizers:
             options = self.options
             if refiners:
@@ -208,7 +212,7 @@ def _query_of(
     prior: Sequence[str] | None,
 ) -> Query:
     name, orientation = "query", 1
-    permitted = None if prior is None else tuple(prior)
+    permitted = None if prior is None else _as_tuple(prior)
     check_image(image)
     if isinstance(image, Path):
         name = image.name  # as in a list or a folder
@@ -315,10 +319,10 @@ def map_photographs(
         photographs that are missing from the map.
     workers, scheduler : as in :func:`build_map`.
     """
-    paths = [images] if isinstance(images, str | Path) else list(images)
+    paths = _as_tuple(images)
     options = options_of_photographs(preset, set or {})
     photographs = Photographs(paths, camera)
-    asked = () if scale is None else (scale,) if scale == "gps" else tuple(map(str, scale))
+    asked = () if scale is None else tuple(map(str, _as_tuple(scale)))
     title = Path(paths[0]).resolve().stem
     place = workspace or Path("runs") / f"{title}-{preset}"
     stages = plan_photographs(photographs, options, mapper, asked)
@@ -459,9 +463,9 @@ def train(
     task: str,
     output: Path | str,
     *,
-    kaptures: Sequence[Path | str] = (),
-    photographs: Sequence[Path | str] = (),
-    held_out: Sequence[Path | str] = (),
+    kaptures: Sequence[Path | str] | Path | str = (),
+    photographs: Sequence[Path | str] | Path | str = (),
+    held_out: Sequence[Path | str] | Path | str = (),
     features: str = "superpoint",
     set: Mapping[str, Any] | None = None,
     threads: int = 1,
@@ -489,9 +493,9 @@ def train(
     return run_training(
         options,
         Path(output),
-        kaptures=[KaptureFolder(path) for path in kaptures],
-        photographs=[Path(path) for path in photographs],
-        held_out=[KaptureFolder(path) for path in held_out],
+        kaptures=[KaptureFolder(path) for path in _as_tuple(kaptures)],
+        photographs=[Path(path) for path in _as_tuple(photographs)],
+        held_out=[KaptureFolder(path) for path in _as_tuple(held_out)],
         force=force,
         threads=threads,
     )

@@ -198,6 +198,8 @@ def test_features_matches_and_a_pose_by_arrays(built: megloc.Map, scene: Path) -
 def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     with pytest.raises(megloc.OptionError, match="prior is for one image"):
         built.localize(scene / "query", prior=["0000.jpg"])
+    with pytest.raises(megloc.DataError, match=r"has the candidate none\.jpg, which is not"):
+        built.localize(next((scene / "query").rglob("*.jpg")), prior="none.jpg")
     with pytest.raises(megloc.OptionError, match="has its own cameras"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)

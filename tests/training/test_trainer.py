@@ -186,7 +186,9 @@ def test_superpoint_descriptors_are_trained_and_read(
     changes = {"features.options": frozen, "steps": 1, "layers": 2, "pairs_per_step": 1}
     changes |= {"device": "cpu", "max_size_px": MAX_SIZE_PX, "max_keypoints": 60}
     changes |= {"learning_rate": 1e-3, "sinkhorn_iterations": 10, "check_every": 2}
-    last = megloc.train("descriptor", output, kaptures=[walk], features="superpoint", set=changes)
+    last = megloc.train(
+        "descriptor", output, kaptures=str(walk), features="superpoint", set=changes
+    )
     assert last["step"] == 1 and np.isfinite(last["loss"])
     before, after = load_file(files["superpoint"]), load_file(output)
     assert set(after) == {key for key in before if not key.startswith("convP")}
