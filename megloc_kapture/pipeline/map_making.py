@@ -49,6 +49,7 @@ from megloc_kapture.pipeline.presets import (
     PRESETS,
     check_weights,
     options_of_preset,
+    options_with,
 )
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.stages.densifying import Densify
@@ -215,8 +216,8 @@ def _structure_options(
             f"--scale takes {GPS}, or two photographs and the metres between them, got "
             f"{' '.join(scale)!r}"
         )
-    known = photographs.known_cameras()
-    return StructureOptions(mapper=mapper, known_cameras=known, distance=distance, gps=gps)
+    known = {"known_cameras": photographs.known_cameras(), "distance": distance, "gps": gps}
+    return options_with(StructureOptions, {"mapper": mapper, **known})
 
 
 def plan_photographs(

@@ -270,6 +270,7 @@ def test_a_map_is_described_with_the_photographs_it_lacks(room: Path, tmp_path: 
     [
         ({"scale": ("0000.jpg", "none.jpg", 1.0)}, "no photograph 'none.jpg'"),
         ({"scale": "gps"}, "0 photographs have a GPS position"),
+        ({"mapper": "glomap"}, "option mapper: it should be 'incremental' or 'global'"),
         ({"set": {"mapping_pairs.by": ["poses"]}}, "have no poses yet"),
         ({"set": {"preprocessing.undistort": True}}, "the distortion of photographs is unknown"),
     ],
