@@ -24,6 +24,7 @@ from megloc_kapture.features.image_bound import extract_bounded
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import (
+    VIDEO_SUFFIXES,
     guessed_camera,
     photo_of,
     pillow_pixels,
@@ -154,21 +155,21 @@ class Map:
         refine: str | Sequence[str] = (),
         workers: int = 1,
     ) -> Pose | Failure | Results:
-        """Localize one image, or all images of a list or a folder.
+        """Localize one image, or all images of a list, folder or video.
 
-        For a single image, return a Pose, or a Failure, which is falsy and has a reason. For a list
-        or a folder, return :class:`Results`, a lazy mapping from image name to Pose or Failure.
+        For a single image, return a Pose, or a Failure, which is falsy and has a reason. Otherwise
+        return :class:`Results`, a lazy mapping from image name to Pose or Failure.
 
         Parameters
         ----------
-        query : image file; uint8 (H, W, 3) RGB; a pillow image; a list of image files; a kapture
-            folder, or a folder of plain images.
+        query : image file; uint8 (H, W, 3) RGB; a pillow image; a video; a list of image files; a
+            kapture folder, or a folder of plain images.
         camera : intrinsics of the pixels as stored, with COLMAP's models and pixel origin. Without
             a camera, an image is rotated upright by its EXIF orientation, and its focal length is
             initialised from EXIF or a guess and estimated with the pose, see ``Pose.camera``.
         prior : names of the map images to match with one image.
         refine : names of pose refiners, applied in order: icp, rendering, field.
-        workers : threads, for lists and folders.
+        workers : threads, for several images.
         """
         if isinstance(query, str):
             query = Path(query)
@@ -182,7 +183,7 @@ class Map:
             many = query
         elif isinstance(query, list | tuple):
             many = Photographs(query, camera)
-        elif isinstance(query, Path) and query.is_dir():
+        elif isinstance(query, Path) and (query.is_dir() or query.suffix.lower() in VIDEO_SUFFIXES):
             many = Photographs([query], camera)
         else:
             return localizer.localize_query(_query_of(query, camera, prior))

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
@@ -130,6 +131,14 @@ def test_photographs_need_no_camera(built: megloc.Map, scene: Path, photos: Path
     lying = built.localize(paths[0], read_photo(paths[0]).camera)
     assert lying and lying.camera and (lying.camera.width, lying.camera.height) == (298, 400)
     assert errors(scene, paths[0].name, lying.cam_from_world)[0] < 0.05
+
+
+def test_a_video_is_localized_by_its_frames(built: megloc.Map, tmp_path: Path) -> None:
+    code = cv2.VideoWriter.fourcc(*"MJPG")
+    film = cv2.VideoWriter(str(tmp_path / "walk.avi"), code, 10, (400, 300))
+    film.write(np.zeros((300, 400, 3), np.uint8))
+    film.release()
+    assert list(built.localize(tmp_path / "walk.avi")) == ["walk.avi/000000.jpg"]
 
 
 def test_a_pose_says_what_it_rests_on(built: megloc.Map, scene: Path) -> None:
