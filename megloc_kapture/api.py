@@ -324,7 +324,7 @@ def map_photographs(
     options = options_of_photographs(preset, set or {})
     photographs = Photographs(paths, camera)
     asked = () if scale is None else tuple(map(str, _as_tuple(scale)))
-    title = Path(paths[0]).resolve().stem
+    title = Path(paths[0]).resolve().name
     place = workspace or Path("runs") / f"{title}-{preset}"
     stages = plan_photographs(photographs, options, mapper, asked)
     made = _run(stages, place, workers, scheduler)

@@ -187,10 +187,13 @@ def test_poses_focal_length_and_scale_are_accurate(room: Path, tmp_path: Path) -
         assert Rotation.from_matrix(ours @ true.T).magnitude() < np.radians(1.0)
 
 
-def test_gps_gives_scale_and_axes(room: Path, tmp_path: Path) -> None:
+def test_gps_gives_scale_and_axes(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     truth = true_poses(room / "mapping", room / "query_gt")
     images = images_of(room)[:6]
-    photos = put(tmp_path / "photos", images)
+    photos = put(tmp_path / "trip.2024", images)
     # twenty times the room, since GPS has errors of decimetres
     origin = truth["0000.jpg"].center()
     at = {image.name: 20 * (truth[image.name].center() - origin) for image in images}
@@ -199,7 +202,8 @@ def test_gps_gives_scale_and_axes(room: Path, tmp_path: Path) -> None:
     for name, position in at.items():
         noisy = position + rng.normal(0, 0.3, 3) + (50.0 * (name == "0003.jpg"))
         with_exif(photos / name, gps=geodetic(earth.apply(noisy[None])[0]))
-    found = megloc.map_photographs(photos, workspace=tmp_path / "map", scale="gps", **FEW)
+    found = megloc.map_photographs(photos, scale="gps", **FEW)
+    assert found.kapture_map.folder.root == tmp_path / "runs/trip.2024-classic/map"
     assert found.kapture_map.unit == "m"
     poses = found.kapture_map.poses
     assert abs(errors(poses, truth)[2] * 20 - 1) < 0.05
