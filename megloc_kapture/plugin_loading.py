@@ -47,16 +47,15 @@ def load_plugin(
     """Make the plugin ``name`` of ``group``, with its options; PluginError if impossible."""
     kind = plugin_class(group, name)
     model: Any = getattr(kind, "Options", None)
-    wanted = placement.model_dump(exclude_defaults=True)
+    given, wanted = options or {}, placement.model_dump(exclude_defaults=True)
     if model is not None:
         known = {key: value for key, value in wanted.items() if key in model.model_fields}
-        options = {**known, **(options or {})}
+        given = {**known, **given}
+    elif given:
+        fault = f"it takes no options, got {', '.join(sorted(given))}"
+        raise PluginError(f"plugin {name!r} rejects its options: {fault}")
     try:
-        if model is None:
-            if options:
-                raise ValueError(f"it takes no options, got {', '.join(sorted(options))}")
-            return kind()
-        return kind(model(**(options or {})))
+        return kind() if model is None else kind(model(**given))
     except MeglocError:
         raise
     except ValidationError as error:
@@ -64,7 +63,7 @@ def load_plugin(
         raise PluginError(f"plugin {name!r} rejects its options: {fault}") from error
     except Exception as error:  # a third-party constructor may raise anything
         reason = " ".join(str(error).split())
-        raise PluginError(f"plugin {name!r} rejects its options: {reason}") from error
+        raise PluginError(f"plugin {name!r} cannot be created: {reason}") from error
 
 
 def checked_array(

@@ -107,7 +107,7 @@ def test_a_plugin_of_another_package_is_found_and_works(outside: Path) -> None:
         ("function", r"'function' .* does not implement LocalFeatureExtractor: it is not a class"),
         ("absent", r"'absent' \(outside_plugin:Absent\) cannot be loaded: .*Absent"),
         ("broken", r"'broken' \(outside_plugin_broken:Grid\) cannot be loaded: no licence"),
-        ("moody", r"'moody' rejects its options: not today"),
+        ("moody", r"'moody' cannot be created: not today"),
         ("missing", r"no plugin 'missing' in megloc_kapture.local_features; reg.*: .*rootsift"),
     ],
 )
