@@ -409,9 +409,10 @@ class Photographs(Queries):
             else:
                 try:
                     pixels = read_image_rgb(path)
-                except DataError:  # reported in status.csv
-                    continue
-                write_image(place, turned_upright(pixels, photo.orientation))
+                except DataError:  # as for other links, readers report the reason
+                    link_file(path, place)
+                else:
+                    write_image(place, turned_upright(pixels, photo.orientation))
 
     def _is_frame(self, name: str) -> bool:
         """Return whether an image is a frame of a video, in the temporary folder of frames."""

@@ -83,12 +83,14 @@ def test_rotated_photographs_are_turned_without_a_given_camera(tmp_path: Path) -
     assert photos.unreadable == {"2.jpg": "the image is 32x48, its camera says 64x48"}
     upright = Photographs([tmp_path], Camera.pinhole(48, 64, 50))
     assert upright.unreadable["1.jpg"].endswith("as stored, before EXIF rotates them")
+    (tmp_path / "3.jpg").write_bytes((tmp_path / "1.jpg").read_bytes()[:-20])
     photos = Photographs([tmp_path])
     assert photos.query("1.jpg").read_image().shape == (64, 48, 3)
     photos.write_images(tmp_path / "out")
     place = tmp_path / "out" / "sensors" / "records_data"
     assert image_size(place / "1.jpg") == (48, 64) and not (place / "1.jpg").is_symlink()
     assert (place / "2.jpg").readlink() == tmp_path / "2.jpg"
+    assert (place / "3.jpg").readlink() == tmp_path / "3.jpg"  # truncated, as its readers report
 
 
 def test_frames_of_a_video(tmp_path: Path) -> None:
