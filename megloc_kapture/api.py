@@ -189,7 +189,7 @@ class Map:
             return localizer.localize_query(_query_of(query, camera, prior))
         if prior is not None:
             raise OptionError(
-                "prior is for one image; a kapture dataset has its priors in its tables"
+                "prior is for one image; a kapture folder has its priors in megloc/priors.csv"
             )
         return Results(localizer, many, workers=workers)
 
@@ -356,7 +356,7 @@ class FinishedRun:
 
     @property
     def report(self) -> Path:
-        """The report as a page."""
+        """Path of the report, an HTML page."""
         return self.workspace / EVALUATION / REPORT_HTML
 
     @cached_property

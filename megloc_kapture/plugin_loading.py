@@ -44,7 +44,7 @@ def load_chosen(group: str, chosen: PluginChoice, placement: NetworkOptions = AU
 def load_plugin(
     group: str, name: str, options: dict[str, Any] | None = None, placement: NetworkOptions = AUTO
 ) -> Any:
-    """Make the plugin ``name`` of ``group``, with its options; PluginError if impossible."""
+    """Create the plugin ``name`` of ``group``; MeglocError if it or its weights are unusable."""
     kind = plugin_class(group, name)
     model: Any = getattr(kind, "Options", None)
     given, wanted = options or {}, placement.model_dump(exclude_defaults=True)
@@ -100,7 +100,7 @@ def option_fault(error: ValidationError, model: type[Options]) -> str:
 
 
 def plugin_class(group: str, name: str) -> Any:
-    """Return the class registered as ``name`` in ``group``; PluginError if impossible."""
+    """Return the class registered as ``name`` in ``group``; PluginError if it cannot be loaded."""
     entries = [entry for entry in entry_points(group=group) if entry.name == name]
     if not entries:
         known = suggestion(name, plugin_names(group), listed="registered: ")

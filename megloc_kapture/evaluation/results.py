@@ -1,4 +1,4 @@
-"""Results (kapture folders, pose files, COLMAP models, memory) and the workspace around them."""
+"""Results (kapture folders, pose files, COLMAP models, objects) and the workspace around them."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _if_there(read: Callable[[Path], Read], path: Path) -> Read | None:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One result, ``cam_from_world`` in the frame of the truth.
+    """One result; ``poses`` are ``cam_from_world`` in the frame of the true poses.
 
     Attributes
     ----------
@@ -289,7 +289,7 @@ def _read_mlad(
             )
     elif path.name not in asked and len(asked) > 1:
         raise DataError(
-            "cannot tell which relocalization file it belongs to; give it the name of that file: "
+            "cannot tell which relocalization file it belongs to; rename it to one of "
             f"{', '.join(sorted(asked))}",
             path=path,
         )

@@ -105,8 +105,8 @@ def focal_misfit(
     """Return a remark if another focal length fits far better than the given one.
 
     The second value is the resulting motion of the camera centre, divided by the median distance of
-    the inliers. Also None for rigs, for few inliers, and if the matches do not determine the focal
-    length.
+    the inliers. Return None otherwise, for rigs, for few inliers, and if the matches do not
+    determine the focal length.
     """
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None

@@ -39,7 +39,8 @@ def pick_device(device: Device) -> torch.device:
     if not count:
         raise OptionError(f"device={device}: this machine has no GPU that torch can use; use auto")
     if int(device.partition(":")[2] or 0) >= count:
-        raise OptionError(f"device={device}: this machine has {count} GPUs, the first is cuda:0")
+        known = ", ".join(f"cuda:{number}" for number in range(count))
+        raise OptionError(f"device={device}: this machine has no such GPU; known: {known}")
     return torch.device("cuda", int(device.partition(":")[2] or 0))
 
 

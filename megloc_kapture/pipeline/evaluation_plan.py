@@ -191,7 +191,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
         source = with_model(run.source)
         if source is None:
             raise OptionError(
-                f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs "
+                f"dataset {run.dataset} comes with no model: mapping_pairs.by covisibility needs "
                 'its points; --set \'mapping_pairs.by=["poses", "retrieval"]\' needs no model'
             )
         run = replace(run, source=source)
@@ -362,6 +362,7 @@ class Evaluate(_RunStage):
         evaluation = evaluate(localized, truth, side_tables=tables, label=label)
         write_report(output, evaluation, provenance=provenance)
         row = evaluation.row()
+        # the log shows the last word of a key as the unit
         recall = {
             f"recall within {at.threshold} percent".replace(",", " and"): round(100 * at.recall, 2)
             for at in row.recall

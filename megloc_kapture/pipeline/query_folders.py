@@ -58,7 +58,7 @@ from megloc_kapture.values import Camera, LocalFeatures, RigidTransform, check_c
 _log = logging.getLogger(__name__)
 
 FRAMES_EVERY = 30
-# how many queries' keypoints are compared with the image size, and how many each must have
+# number of queries whose keypoints are compared with the image size, and of keypoints each needs
 _QUERIES_COMPARED, _MIN_COMPARED = 10, 100
 _LIST_SUFFIXES = (".txt", ".csv")
 
@@ -66,8 +66,8 @@ _LIST_SUFFIXES = (".txt", ".csv")
 class Queries(ABC):
     """Query images, read one at a time.
 
-    ``unreadable`` has, by image name, the reason why an image cannot be used; ``faults`` the reason
-    why its features cannot be used. ``faults`` is filled when queries are read.
+    ``unreadable`` maps names of unusable images to the reason, and ``faults`` those of images with
+    unusable features. ``faults`` is filled when queries are read.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class Queries(ABC):
         self.unreadable: dict[str, str] = {}
         self.faults: dict[str, str] = {}
 
-    def check(self) -> None:  # noqa: B027  # the constructor of photographs checks them
+    def check(self) -> None:  # noqa: B027  # Photographs checks in its constructor
         """Check everything that can be checked without reading features or pixels."""
 
     def lacking(self, local_type: str) -> str | None:
@@ -130,7 +130,7 @@ class KaptureQueries(Queries):
             plain = plain_name(base)
             serving = [name for name in brought if plain_name(base_type(name)) == plain]
             if serving and base not in self._local:
-                # a type can replace its guided-pyramid type, and vice versa
+                # features of a plain type serve its guided-pyramid type, and vice versa
                 name = min(serving, key=lambda name: (name != base, name != base_type(name), name))
                 of_map = kapture_map.keypoints_of(stored)
                 self._local[base] = replace(of_map, folder=folder, name=name)
@@ -230,7 +230,7 @@ class KaptureQueries(Queries):
                     reach.append(float((pixels / size).max()))
         if reach and not 0.7 < max(reach) < 1.1:
             message = (
-                "%s: keypoints of type %r reach to %.0f %% of the size of the query images; scale "
+                "%s: keypoints of type %r extend to %.0f %% of the size of the query images; scale "
                 "them if they were extracted at another image size, or the poses will be wrong"
             )
             _log.warning(message, self._folder.root, local.name, 100 * max(reach))
@@ -311,7 +311,7 @@ class Photographs(Queries):
         hidden files, nested kapture folders and megloc outputs are skipped. The name of an image is
         its path below the given folder, or its file name; a frame is ``walk.mp4/000120.jpg``. A
         given kapture folder contributes its images and calibrated cameras.
-    camera : camera of all images, or a list of cameras by image; replaces EXIF and kapture cameras.
+    camera : camera of all images, or cameras by image name; replaces EXIF and kapture cameras.
     every : take every n-th frame of a video; 30 by default.
     """
 
@@ -324,7 +324,7 @@ class Photographs(Queries):
     ) -> None:
         super().__init__()
         if every is not None and every < 1:
-            raise OptionError(f"every {every}th frame cannot be used; give 1 or more")
+            raise OptionError(f"every is {every}; give 1 or more")
         check_option(paths, "no photographs are given; name image files or folders")
         for each in camera.values() if isinstance(camera, Mapping) else (camera,):
             if each is not None:
@@ -465,7 +465,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         elif path.exists():
             require(
                 path.suffix.lower() not in _LIST_SUFFIXES,
-                "not an image; give a list of cameras with --camera",
+                "not an image; if it lists cameras, give it with --camera",
                 path=path,
             )
             files = {path.name: path}
@@ -474,8 +474,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         for name, file in files.items():
             if name in by_name:
                 raise DataError(
-                    f"{by_name[name]} has the same path relative to its given folder; give a "
-                    "common parent folder",
+                    f"{by_name[name]} would have the same name; give a common parent folder",
                     path=file,
                 )
             _check_name(name, file)

@@ -204,7 +204,7 @@ def relit(image: Image, rng: np.random.Generator) -> Image:
     cast = np.exp2(rng.normal(0, 0.12, 3))
     noise, blur = rng.uniform(0, 0.04), rng.uniform(0, 1.2)
     level = (image.astype(np.float32) / 255) ** np.float32(gamma)
-    # values above white are clipped, so exposure is mostly reduced
+    # brightening is limited, because values above white are clipped
     level *= (min(exposure, 1.3) * cast).astype(np.float32)
     if blur > 0.3:
         level = np.asarray(cv2.GaussianBlur(level, (0, 0), float(blur)), np.float32)

@@ -113,10 +113,10 @@ def test_unusable_files_and_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24")
     for paths, message in (
-        ([one, two], "same path"),
+        ([one, two], "same name"),
         ([tmp_path / "nowhere"], "no such file"),
         ([tmp_path / "empty"], "no image or video"),
-        ([tmp_path / "cameras.txt"], "give a list of cameras with --camera"),
+        ([tmp_path / "cameras.txt"], "if it lists cameras, give it with --camera"),
         ([write(tmp_path / "Paris, Texas.jpg")], "rename the file"),
         ([write(tmp_path / "#1.jpg")], "rename the file"),
     ):

@@ -43,7 +43,8 @@ def read_calibration(folder: Path) -> Calibration:
     """Read the cameras of the undistorted images: cam0, the left one, and cam1.
 
     The dataset's page says that the stereo file has the transform "from the right to the left
-    camera", but camchain.yaml, the sign and all users of the data agree on cam1 from cam0.
+    camera", but camchain.yaml, the sign of the translation and all users of the data agree on cam1
+    from cam0.
     """
     cam0, cam1 = (read_pinhole(folder / name) for name in CAMERA_FILES)
     cam1_from_cam0 = read_transform(folder / STEREO_FILE, comments=True)
@@ -219,7 +220,7 @@ def find_recordings(root: Path) -> dict[str, Recording]:
     if not recordings:
         deeper = next(root.glob(f"*/*/{_IMAGES}"), None)
         hint = f"; there is one in {deeper.parents[1].name}/: give it as the root" if deeper else ""
-        reason = f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it{hint}"
+        reason = f"no recording here (a folder with {_IMAGES}/ or {GNSS_POSES}){hint}"
         raise DataError(reason, path=root)
     return recordings
 
@@ -230,7 +231,7 @@ def _folders(root: Path) -> list[Path]:
 
 
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
-    """Find relocalization files; one whose name lacks the source must lie in its folder."""
+    """Find relocalization files; one whose name lacks the source must be in the source's folder."""
     known = set(recordings)
     files: dict[str, RelocalizationFile] = {}
     for folder in _RELOCALIZATION_FOLDERS:
@@ -310,9 +311,7 @@ def _check_names(
     unknown = sorted(set(names) - set(recordings))
     if unknown:
         known = ", ".join(recordings)
-        raise OptionError(
-            f"option {option}: no recording {unknown[0]!r} in {root}; there are {known}"
-        )
+        raise OptionError(f"option {option}: no recording {unknown[0]!r} in {root}; known: {known}")
 
 
 def _default_references(
