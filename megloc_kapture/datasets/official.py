@@ -36,6 +36,7 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 GROUND_TRUTH = "ground_truth"
 REFERENCE = "reference"
 _MISSING_SHOWN = 5
+_ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz")
 
 
 class DatasetCard(Options):
@@ -48,12 +49,19 @@ class DatasetCard(Options):
     layout: str
 
     def without(self, root: Path, absent: Sequence[str]) -> DataError:
-        inner = (path.parent for path in sorted(root.glob(f"*/{absent[0]}")))
-        nested = next((path for path in inner if all((path / n).is_dir() for n in absent)), None)
-        remedy = f"the root must contain {self.layout}"
-        if nested is not None:
-            remedy = f"there is one in {nested.name}/: give it as the root, or move it up"
+        near = root.parent, *(path.parent for path in sorted(root.glob(f"*/{absent[0]}")))
+        found = next((path for path in near if all((path / n).is_dir() for n in absent)), None)
+        packed = next((f"; is {path} extracted?" for path in archives(root)), "")
+        remedy = f"the root must contain {self.layout}{packed}"
+        if found is not None:
+            remedy = f"there is one in {found}/: give it as the root"
         return DataError(f"not {self.title}, no folder {' and '.join(absent)}; {remedy}", path=root)
+
+
+def archives(root: Path) -> list[Path]:
+    """Return the paths of archives below ``root``, relative to it."""
+    files = root.rglob("*")
+    return sorted(path.relative_to(root) for path in files if path.name.lower().endswith(_ARCHIVES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,18 +108,35 @@ class Missing:
             return
         parts = self.by_folder()
         more = len(parts) - _MISSING_SHOWN
-        # archives are often extracted one folder too deep
-        moved = next(self.root.rglob(f"{self.files[0].parent.name}/{self.files[0].name}"), None)
         raise DataError(
             f"{len(self.files)} files are missing: {', '.join(parts[:_MISSING_SHOWN])}"
             + (f", and files of {more} more folders" if more > 0 else "")
-            + (f"; {moved.name} is at {self._shown(moved.parent)}/" if moved else "")
+            + self._found(self._shown(self.files[0]).parts)
             + "; --allow-missing imports the rest",
             path=self.root,
         )
 
+    def _found(self, parts: Sequence[str]) -> str:
+        """Return where a missing file is: in an archive, or in a folder too deep or too high."""
+        for path in archives(self.root):
+            if path.name.startswith(parts[:-1]):
+                return f"; is {path} extracted?"
+        for path in self.root.rglob("*"):
+            found = self._shown(path).parts
+            if path.name.lower() == parts[-1].lower() and (
+                _in_order(parts, found) or _in_order(found, parts)
+            ):
+                return f"; {path.name} is at {self._shown(path.parent)}/"
+        return ""
+
     def _shown(self, file: Path) -> Path:
         return file.relative_to(self.root) if file.is_relative_to(self.root) else file
+
+
+def _in_order(parts: Sequence[str], others: Sequence[str]) -> bool:
+    """Return whether ``others`` has all ``parts``, except for their case, in the same order."""
+    rest = iter(other.lower() for other in others)
+    return all(part.lower() in rest for part in parts)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

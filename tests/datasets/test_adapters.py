@@ -73,17 +73,58 @@ def test_a_folder_without_the_layout_is_refused(
 def test_a_layout_one_folder_deeper_is_named(layouts: Path, tmp_path: Path, dataset: str) -> None:
     shutil.copytree(layouts / dataset, tmp_path / "zip" / dataset)
     adapter: Any = load_plugin(DATASETS, dataset, {})
-    with pytest.raises(DataError, match=f"there is one in {dataset}/: give it as the root"):
+    with pytest.raises(DataError, match=f"there is one in .*{dataset}/: give it as the root"):
         adapter.check(tmp_path / "zip")
 
 
-def test_missing_files_one_folder_deeper_are_named(layouts: Path, tmp_path: Path) -> None:
-    root = without(layouts, "robotcar", tmp_path)
-    (root / "images" / "night").rename(tmp_path / "night")
-    shutil.copytree(tmp_path / "night", root / "images" / "night" / "night")
-    missing = load_plugin(DATASETS, "robotcar", {}).read(root, allow_missing=True).missing
-    with pytest.raises(DataError, match=f"{ts(13)}.jpg is at images/night/night/left/; --allow"):
+def test_a_folder_inside_the_layout_names_the_layout(layouts: Path) -> None:
+    with pytest.raises(DataError, match="there is one in .*robotcar/: give it as the root"):
+        load_plugin(DATASETS, "robotcar", {}).check(layouts / "robotcar" / "images")
+
+
+def test_an_archive_in_place_of_a_folder_is_named(layouts: Path, tmp_path: Path) -> None:
+    root = without(layouts, "aachen", tmp_path, "images_upright")
+    (root / "images").mkdir()
+    (root / "images" / "database_and_query_images.zip").touch()
+    message = "; is images/database_and_query_images.zip extracted[?]"
+    with pytest.raises(DataError, match=message):
+        load_plugin(DATASETS, "aachen", {}).check(root)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "folder", "moved_to", "hint"),
+    [
+        ("robotcar", "images/night", "images/night/night", f"; {ts(13)}.jpg is at images/night/ni"),
+        ("robotcar", "images/night", "images/nights", ""),
+        ("robotcar", "images/night", "images/night.zip", "; is images/night.zip extracted[?]"),
+        (
+            "aachen",
+            "images_upright/db",
+            "images_upright/DB",
+            "; [0-9]+.jpg is at images_upright/DB/",
+        ),
+        (
+            "inloc",
+            "database/alignments/DUC2/transformations",
+            "database/alignments/DUC2",
+            "; DUC_trans_024.txt is at database/alignments/DUC2/",
+        ),
+        ("inloc", "database/alignments/DUC2", "../gone", ""),  # DUC1's files have the same names
+    ],
+)
+def test_the_place_of_missing_files_is_named(
+    layouts: Path, tmp_path: Path, dataset: str, folder: str, moved_to: str, hint: str
+) -> None:
+    root = without(layouts, dataset, tmp_path)
+    (root / folder).rename(tmp_path / "moved")
+    if moved_to.endswith(".zip"):
+        (root / moved_to).touch()
+    else:
+        shutil.copytree(tmp_path / "moved", root / moved_to, dirs_exist_ok=True)
+    missing = load_plugin(DATASETS, dataset, {}).read(root, allow_missing=True).missing
+    with pytest.raises(DataError, match=f"{folder}/[^;]*{hint}.*; --allow-missing") as error:
         missing.refuse()
+    assert bool(hint) == ("is at" in str(error.value) or "extracted" in str(error.value))
 
 
 @pytest.mark.parametrize(
