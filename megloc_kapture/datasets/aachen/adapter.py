@@ -106,6 +106,13 @@ class Layout:
         """Return ``wanted``, or the latest version that has a model."""
         if wanted == "auto":
             wanted = "1.1" if self.colmap_model.is_dir() else "1.0"
+            stray = next(self.root.rglob("aachen_v*1_1*"), None) if wanted == "1.0" else None
+            require(
+                stray is None,
+                f"v1.1's {stray} is not in place: its model belongs in {self.colmap_model}/, its "
+                f"images in {self.images}/; version=1.0 imports v1.0",
+                path=self.root,
+            )
         model = self.nvm if wanted == "1.0" else self.colmap_model
         require(
             model.exists(),

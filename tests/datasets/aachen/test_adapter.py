@@ -177,6 +177,12 @@ def test_contradictory_lists_are_named(
 def test_the_model_of_the_chosen_version_is_required(root: Path) -> None:
     with pytest.raises(DataError, match=r"v1\.1 is missing: 3D-models/aachen_v_1_1"):
         Aachen(AachenOptions(version="1.1")).check(root)
+    (root / "aachen_v1_1" / "3D-models").mkdir(parents=True)  # its archive, extracted elsewhere
+    with pytest.raises(DataError, match=r"v1\.1's .*/aachen_v1_1 is not in place"):
+        Aachen().check(root)
+    Aachen(AachenOptions(version="1.0")).check(root)
+    (root / "aachen_v1_1" / "3D-models").rmdir()
+    (root / "aachen_v1_1").rmdir()
     (root / MODEL).unlink()
     with pytest.raises(DataError, match=r"v1\.0 is missing: 3D-models/aachen_cvpr2018_db\.nvm"):
         Aachen().check(root)
