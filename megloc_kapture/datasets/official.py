@@ -116,7 +116,7 @@ class Missing:
             path=self.root,
         )
 
-    def _found(self, parts: Sequence[str]) -> str:
+    def _found(self, parts: tuple[str, ...]) -> str:
         """Return where a missing file is: in an archive, or in a folder too deep or too high."""
         for path in archives(self.root):
             if path.name.startswith(parts[:-1]):

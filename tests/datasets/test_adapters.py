@@ -77,9 +77,11 @@ def test_a_layout_one_folder_deeper_is_named(layouts: Path, tmp_path: Path, data
         adapter.check(tmp_path / "zip")
 
 
-def test_a_folder_inside_the_layout_names_the_layout(layouts: Path) -> None:
-    with pytest.raises(DataError, match="there is one in .*robotcar/: give it as the root"):
-        load_plugin(DATASETS, "robotcar", {}).check(layouts / "robotcar" / "images")
+@pytest.mark.parametrize("inside", ["robotcar/images", f"4seasons/{DAY}"])
+def test_a_folder_inside_the_layout_names_the_layout(layouts: Path, inside: str) -> None:
+    dataset = inside.partition("/")[0]
+    with pytest.raises(DataError, match=f"there is one in .*{dataset}/: give it as the root"):
+        load_plugin(DATASETS, dataset, {}).check(layouts / inside)
 
 
 def test_an_archive_in_place_of_a_folder_is_named(layouts: Path, tmp_path: Path) -> None:

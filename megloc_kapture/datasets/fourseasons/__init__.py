@@ -218,8 +218,9 @@ def find_recordings(root: Path) -> dict[str, Recording]:
         if any((folder / mark).exists() for mark in _MARKS)
     }
     if not recordings:
-        deeper = next(root.glob(f"*/*/{_IMAGES}"), None)
-        hint = f"; there is one in {deeper.parents[1].name}/: give it as the root" if deeper else ""
+        found = next(root.glob(f"*/*/{_IMAGES}"), root.resolve() / _IMAGES)
+        found_in = f"; there is one in {found.parent.parent}/: give it as the root"
+        hint = found_in if found.exists() else ""
         reason = f"no recording here (a folder with {_IMAGES}/ or {GNSS_POSES}){hint}"
         raise DataError(reason, path=root)
     return recordings
@@ -289,12 +290,14 @@ def select(
         targets = sorted({f.target for f in files if f.source in sources} - set(sources))
     if not targets:
         targets = [name for name in recordings if name not in sources] or [ANOTHER_RECORDING]
-    missing.files += [root / name for name in (*sources, *targets) if name not in recordings]
+    absent = [name for name in (*sources, *targets) if name not in recordings]
+    missing.files += [root / name for name in absent]
     sources, targets = ([n for n in names if n in recordings] for names in (sources, targets))
     require(
         sources,
         f"{len(recordings)} recordings, none for the map; a recording with published poses "
-        "(GNSSPoses.txt or poses.txt) and another one for the queries are needed",
+        "(GNSSPoses.txt or poses.txt) and another one for the queries are needed"
+        + (f"; the relocalization files name {absent[0]}" if files and absent else ""),
         path=root,
     )
     return Selection(

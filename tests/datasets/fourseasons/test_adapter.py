@@ -232,6 +232,10 @@ def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
     write(root / f"reloc_{DAY}_to_garage.txt", f"{A} 1\n")
     assert missing_of(read(root)) == [root / "garage"]
     assert not missing_of(read(root, queries=SNOW))
+    (root / DAY).rename(root / "renamed")
+    with pytest.raises(DataError, match=f"none for the map; .*the relocalization files name {DAY}"):
+        read(root, queries=SNOW)
+    (root / "renamed").rename(root / DAY)
     shutil.rmtree(root / SNOW)
     assert missing_of(read(root)) == [root / "garage", root / SNOW]
     write(root / "relocalizationFile_garage.txt", f"{A} 1\n")
