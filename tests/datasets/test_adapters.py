@@ -111,6 +111,7 @@ def test_an_archive_in_place_of_a_folder_is_named(layouts: Path, tmp_path: Path)
             "database/alignments/DUC2",
             "; DUC_trans_024.txt is at database/alignments/DUC2/",
         ),
+        ("inloc", "query/iphone7", "query/iphone7/iphone7", ""),
         ("inloc", "database/alignments/DUC2", "../gone", ""),  # DUC1's files have the same names
     ],
 )
@@ -142,6 +143,7 @@ def test_the_place_of_missing_files_is_named(
         ("4seasons", f"{SNOW}/undistorted_images/cam1", f"{SNOW}/.*cam1", 4, 2),
         ("inloc", f"{CUTOUTS}/DUC1/024/DUC_cutout_024_30_0.jpg", "DUC_cutout_024_30_0.jpg", 71, 3),
         ("inloc", f"{CUTOUTS}/DUC1/024/DUC_cutout_024_0_0.jpg.mat", "0_0.jpg.mat", 72, 3),
+        ("robotcar", "3D-models/individual", "/queries_location_001.txt", 9, 0),
         ("inloc", f"{CUTOUTS}/DUC2", f"{CUTOUTS}/DUC2", 36, 3),
         ("inloc", f"{CUTOUTS}/DUC2/024", f"{CUTOUTS}/DUC2/<scans>", 36, 3),
         ("inloc", "database/alignments/DUC2/transformations/DUC_trans_024.txt", "trans", 36, 3),

@@ -102,7 +102,11 @@ def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.
     from scipy.io import loadmat
 
     with reading(path, f"a MAT file with {POINTS}"):
-        points = np.asarray(loadmat(path, variable_names=[POINTS])[POINTS], np.float64)
+        try:
+            points = np.asarray(loadmat(path, variable_names=[POINTS])[POINTS], np.float64)
+        except NotImplementedError as error:
+            reason = "a MAT file of version 7.3, which scipy cannot read; in MATLAB save it by -v7"
+            raise DataError(reason, path=path) from error
     if points.shape != (height, width, 3):
         shape = "x".join(map(str, points.shape))
         raise DataError(f"{POINTS} is {shape}, expected {height}x{width}x3", path=path)
@@ -131,6 +135,7 @@ class Layout:
             cutouts, alignments, query = (
                 _first(root / name, names) for names in (_CUTOUTS, _ALIGNMENTS, _QUERIES)
             )
+            query = query or _first(root, _QUERIES)
             if cutouts is None:
                 continue
             if alignments is None or query is None:
@@ -139,8 +144,10 @@ class Layout:
             return cls(cutouts, alignments, query)
         raise DataError(f"{_CUTOUTS[0]}/ is missing; the layout of InLoc is {LAYOUT}", path=root)
 
-    def queries(self) -> list[str]:
-        return [name for name in _listed(self.query) if name.lower().endswith(_PHOTOGRAPH)]
+    def queries(self, missing: Missing) -> list[str]:
+        names = [name for name in _listed(self.query) if name.lower().endswith(_PHOTOGRAPH)]
+        missing.files += [] if names else [self.query / "<photographs>.JPG"]
+        return names
 
     def scans(self, floor: str, missing: Missing) -> list[Scan]:
         folder = self.cutouts / floor

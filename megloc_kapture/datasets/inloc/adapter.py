@@ -111,7 +111,7 @@ class InLoc:
             "them is imported with the option depth = false",
             path=layout.cutouts,
         )
-        names = [f"{QUERIES}/{name}" for name in layout.queries()]
+        names = [f"{QUERIES}/{name}" for name in layout.queries(missing)]
         query = _queries(names, layout.query)
         truth, true_groups = read_ground_truth(root, query, World())
         groups = {image: true_groups.get(image, ImageGroup()) for image in names}

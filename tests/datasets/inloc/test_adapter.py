@@ -10,6 +10,7 @@ import pytest
 from inloc_files import write_download
 from PIL import Image
 
+from megloc_kapture.datasets.inloc import read_cutout_points
 from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
@@ -128,6 +129,7 @@ def test_wrongly_placed_scans_are_skipped(root: Path) -> None:
     [
         ({"database": "dataset/database", "query": "dataset/query"}, "dataset/database/cutouts"),
         ({"database/cutouts": "cutouts", "database/alignments": "alignments"}, "cutouts"),
+        ({"database": "dataset"}, "dataset/cutouts"),
         ({"database/cutouts": "database/cutouts_imageonly"}, "database/cutouts_imageonly"),
     ],
 )
@@ -141,6 +143,13 @@ def test_layouts_of_redistributions_are_accepted(
     mapping.validate(deep=True)
     name = "DUC2/024/DUC_cutout_024_30_-30.jpg"
     assert mapping.image_path(f"database/cutouts/{name}").resolve() == root / place / name
+
+
+def test_points_of_matlab_7_3_are_refused_with_the_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg.mat"
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(384))
+    with pytest.raises(DataError, match="version 7.3, .* save it by -v7"):
+        read_cutout_points(path, 2, 2)
 
 
 def test_a_download_without_points_is_imported_without_depth(root: Path, tmp_path: Path) -> None:
