@@ -32,6 +32,7 @@ from megloc_kapture.io.dataset_tables import PoseFileFormat, PoseFileNames
 from megloc_kapture.io.files import named, read_content, read_json_model, read_text, write_json
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.io.text_lines import fields_of, reading_lines
 from megloc_kapture.values import RigidTransform
 
 _log = logging.getLogger(__name__)
@@ -143,8 +144,9 @@ def _in_column_order(rows: Iterable[tuple[int, list[str]]]) -> Iterator[tuple[in
     """Choose the columns that a header names, as in ``poses.csv``; without one, keep all."""
     header: list[str] = []
     for number, fields in rows:
-        if set(COLUMNS.split()[1:]) <= set(fields):
-            header = fields
+        names = [field.lower().replace("_", "") for field in fields]
+        if set(COLUMNS.split()[1:]) <= set(names):
+            header = names
         elif len(fields) == len(header):
             yield number, [fields[0], *(fields[header.index(c)] for c in COLUMNS.split()[1:])]
         else:
@@ -201,7 +203,7 @@ def _stem(name: str) -> str:
 def parse_number(text: str) -> float:
     if FLOAT_PATTERN.fullmatch(text):
         return float(text)
-    if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+    if text.lower().lstrip("+-") in ("nan", "inf", "infinity", "none", ""):
         return math.nan
     raise DataError(f"{text!r} is not a number")
 
@@ -226,8 +228,9 @@ def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> Rigid
         tx, ty, tz, qx, qy, qz, qw = numbers
     else:
         qw, qx, qy, qz, tx, ty, tz = numbers
+        first, last = (abs(math.hypot(*quat) - 1) for quat in (numbers[:4], numbers[3:]))
         require(
-            abs(math.hypot(*numbers[3:]) - 1) > 0.01 or abs(math.hypot(*numbers[:4]) - 1) < 0.01,
+            first < 0.01 or not last <= 0.01,  # also if they are nan
             f"{whose}: the quaternion is last, as in trajectories (TUM, EuRoC) of world_from_cam, "
             "which `megloc export tum` and evo compare, and as in Cambridge Landmarks (camera "
             "centre, then w x y z); a pose file has it first, w x y z, and cam_from_world",
@@ -275,15 +278,16 @@ def format_mlad_file(poses: Mapping[tuple[int, int], RigidTransform]) -> str:
 
 
 def read_mlad_file(path: Path | str) -> RelativePoses:
-    """Read a pose file or a relocalization file, in file order."""
+    """Read a pose file or a relocalization file, in file order.
+
+    Rows of nan or zeros, which other tools write for failed queries, become the identity, the mark
+    of a missing pose. Commas, CRLF, empty lines and comments are accepted.
+    """
     poses: RelativePoses = {}
     columns = 0
-    for number, line in enumerate(read_text(path).split("\n"), start=1):
-        fields = line.split()
-        if not fields:
-            continue
-        columns = columns or (2 if len(fields) == 2 else 9)
-        with named(path, number):
+    with reading_lines(Path(path), comments=True) as lines:
+        for fields in map(fields_of, lines):
+            columns = columns or (2 if len(fields) == 2 else 9)
             if len(fields) != columns:
                 wanted = f"9 ({MLAD_COLUMNS})" if columns == 9 else "2, as in the rows before"
                 raise DataError(f"{len(fields)} columns instead of {wanted}")
@@ -291,8 +295,12 @@ def read_mlad_file(path: Path | str) -> RelativePoses:
             whose, pose = f"pair {reference} {query}", None
             require((reference, query) not in poses, f"{whose} is given twice")
             if columns == 9:
-                pose = parse_pose(fields[2:], "mlad", whose)
-        poses[reference, query] = pose
+                values = [parse_number(field) for field in fields[2:]]
+                failed = not np.isfinite(values).all() or not any(values[3:])
+                pose = (
+                    RigidTransform.identity() if failed else parse_pose(fields[2:], "mlad", whose)
+                )
+            poses[reference, query] = pose
     return poses
 
 

@@ -140,6 +140,7 @@ GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
         ("b.jpg 0 0 0 0 1 -0.2 3", "pose", "b.jpg: rotation is not a unit quaternion (length 0)"),
         ("b.jpg 10 20 30 0.6 0.8 0 0", "pose", "the columns are name qw qx qy qz tx ty tz"),
         ("a.jpg 1 0 0 0 1 -0.2 3", "duplicate", "given twice, first on line 1"),
+        ("b.jpg nan nan nan nan nan nan nan", "pose", "b.jpg: the pose is not finite"),
     ],
 )
 def test_wrong_rows(check: Check, line: str, kind: str, words: str) -> None:
