@@ -39,11 +39,11 @@ from megloc_kapture.errors import (
 )
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
-from megloc_kapture.io.files import first_problem, write_bytes
+from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS
-from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_names
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
 from megloc_kapture.values import Options
 
@@ -322,12 +322,12 @@ def find_benchmark(dataset: str) -> BenchmarkFile:
 
 def read_benchmark(path: Path) -> BenchmarkFile:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         return BenchmarkFile.model_validate(content)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"not TOML: {error}", path=path) from error
     except ValidationError as error:
-        raise DataError(first_problem(error), path=path) from error
+        raise DataError(option_fault(error, BenchmarkFile), path=path) from error
 
 
 def _has_depth(root: Path) -> bool:

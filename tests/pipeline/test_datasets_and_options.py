@@ -167,6 +167,7 @@ def test_a_twin_has_the_options_of_its_dataset_without_published_figures() -> No
     [
         (b"dataset = ", "b.toml: not TOML: "),
         (b'dataset = "x"\n[presets.best]\n', "b.toml: presets: .*unknown preset 'best'; known: "),
+        (b'\xef\xbb\xbfdataset = "x"\n[option]\n', "option 'option'; did you mean 'options'"),
     ],
 )
 def test_an_invalid_benchmark_file_is_named(tmp_path: Path, content: bytes, message: str) -> None:
