@@ -201,9 +201,9 @@ def localize_in_clusters(
         return Failure("no match has a map point", seconds=clock.seconds), None
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
     of_ranker = np.asarray(rank(hypotheses) if hypotheses else (), np.float64)
-    if of_ranker.shape != (len(hypotheses),):
-        shape = of_ranker.shape
-        raise PluginError(f"the pose ranker's scores have shape {shape}, not ({len(hypotheses)},)")
+    if of_ranker.shape != (len(hypotheses),) or np.isnan(of_ranker).any():
+        wanted = f"expected {len(hypotheses)} numbers"
+        raise PluginError(f"the pose ranker returned {of_ranker.tolist()}, {wanted}")
     scores = iter(of_ranker.tolist())
     ranked = tuple(
         each.result(None if each.hypothesis is None else next(scores)) for each in attempts

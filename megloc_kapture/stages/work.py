@@ -71,8 +71,9 @@ def in_batches(
         batch = items[len(finished) :][:most]
         try:
             results = run(batch)
-        except RuntimeError as error:
+        except Exception as error:  # plugins may raise anything
             if not is_out_of_memory(error):
+                error.add_note(f"{key[0]} failed on {name(len(finished))}")
                 raise
             if len(batch) == 1:
                 raise MeglocError(

@@ -135,8 +135,9 @@ def test_the_ranker_chooses_the_cluster() -> None:
     # ties go to the first
     result, _ = localize(view(SHARES), rank=lambda hypotheses: [1] * len(hypotheses))
     assert isinstance(result, Pose) and result.cluster == 0
-    with pytest.raises(PluginError, match=r"ranker's scores have shape \(1,\), not \(2,\)"):
-        localize(view(SHARES), rank=lambda _: np.ones(1))
+    for scores in (np.ones(1), np.full(2, np.nan)):
+        with pytest.raises(PluginError, match=r"ranker returned \[.*\], expected 2 numbers"):
+            localize(view(SHARES), rank=lambda _, scores=scores: scores)
 
 
 def test_clusters_of_the_same_place_are_merged() -> None:

@@ -145,6 +145,9 @@ def test_memory_that_runs_out_halves_the_batch(eight_at_once: None, frames: Any)
     none = Limited(most=0)
     with pytest.raises(MeglocError, match=r"image 0\.jpg: not enough memory"):
         extract_all(none, frames, NAMES)
+    with pytest.raises(TypeError) as failure:
+        extract_all(Limited(None), frames, NAMES)
+    assert failure.value.__notes__ == ["Limited failed on image 0.jpg"]
     image = ImageFeatures(np.zeros((3, 2), np.float32), np.zeros((3, 4), np.float32), 8, 8)
     with pytest.raises(MeglocError, match="pair 0, 1: not enough memory"):
         match_all(none, image, [image] * 3, ["pair 0, 1", "pair 0, 2", "pair 0, 3"])

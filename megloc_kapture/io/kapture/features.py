@@ -327,5 +327,11 @@ class FeatureWriter:
 
     def write(self, image: str, array: ArrayLike) -> None:
         """Write an image's array, (N, dsize) or (dsize,)."""
-        content = np.ascontiguousarray(array, dtype=self.config.dtype).tobytes()
-        write_bytes(safe_join(self._folder, check_field(image) + SUFFIX[self.kind]), content)
+        content = np.ascontiguousarray(array, dtype=self.config.dtype)
+        require(
+            content.size == 0 or content.shape[-1] == self.config.dsize,
+            f"image {image}: {content.shape[-1]} columns, but {self.config.dsize} in the "
+            f"{self.kind} of other images",
+        )
+        path = safe_join(self._folder, check_field(image) + SUFFIX[self.kind])
+        write_bytes(path, content.tobytes())

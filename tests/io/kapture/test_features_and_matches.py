@@ -89,6 +89,9 @@ def test_a_writer_continues_a_folder_of_the_same_configuration_only(tmp_path: Pa
     assert "b" not in writer
     with pytest.raises(OutputError, match="another configuration"):
         FeatureWriter(tmp_path, "keypoints", "T", FeatureConfig("n", np.dtype("float32"), 2))
+    with pytest.raises(DataError, match="image b: 6 columns, but 3 in the keypoints of other"):
+        writer.write("b", np.zeros((1, 6)))
+    assert "b" not in writer
 
 
 def test_members_of_a_tar_of_the_current_folder_are_read_by_name(tmp_path: Path) -> None:
