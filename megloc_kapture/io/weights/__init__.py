@@ -259,7 +259,7 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     ``is_shared_file`` and does not copy them.
     """
     check_sha256(file, file.published)
-    if file.path.suffix == ".safetensors":
+    if _is_safetensors(file.path):
         from safetensors.torch import load_file
 
         with reading(file.path, "a safetensors file"):
@@ -269,6 +269,12 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     for tensor in tensors.values():
         tensor.is_shared_file = mapped  # type: ignore[attr-defined]
     return tensors
+
+
+def _is_safetensors(path: Path) -> bool:
+    """Return whether a file begins with the length of a JSON header and the header."""
+    with reading(path), open(path, "rb") as file:
+        return file.read(9)[8:] == b"{"
 
 
 def check_sha256(file: WeightsFile, published: PublishedFile | None) -> None:
@@ -347,7 +353,10 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, track: Track | Non
     except requests.exceptions.HTTPError as error:
         raise MeglocError(f"{url}: the server answers {error}") from error
     except requests.exceptions.RequestException as error:
-        raise MeglocError(f"{url}: the transfer failed: {error}") from error
+        raise MeglocError(
+            f"{url}: the transfer failed: {error}; without a network, download the file elsewhere "
+            "and run: megloc weights add FILE"
+        ) from error
     except ValueError as error:  # pooch: wrong sha256
         raise DataError(f"the download is not the published file: {error}", path=url) from error
     except OSError as error:

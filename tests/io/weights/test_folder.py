@@ -138,9 +138,14 @@ def test_another_file_under_a_published_name_is_refused(folder: Path) -> None:
         read_weights(file)
 
 
+def test_safetensors_are_recognised_by_content(tmp_path: Path) -> None:
+    save_file({"module.a": torch.ones(1)}, tmp_path / "net.pth")
+    assert list(read_weights(find_weights(str(tmp_path / "net.pth")))) == ["a"]
+
+
 def test_a_broken_download_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    with pytest.raises(MeglocError, match="the transfer failed"):
+    with pytest.raises(MeglocError, match="the transfer failed.*run: megloc weights add FILE"):
         fetch("http://127.0.0.1:9/net.pth", tmp_path / "net.pth")
     assert list(tmp_path.iterdir()) == []
 
