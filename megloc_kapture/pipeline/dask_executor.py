@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from distributed import Client, KilledWorker, LocalCluster, Worker, WorkerPlugin
+from distributed.comm.addressing import get_address_host_port
 
 from megloc_kapture.errors import MeglocError, OptionError, check_option
 from megloc_kapture.pipeline.executors import enter_single_threaded
@@ -83,9 +84,12 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
 def _client(stack: ExitStack, workers: int, scheduler: str | None) -> Client:
     if scheduler is not None:
         try:
+            get_address_host_port(scheduler, strict=True)  # a client without a port fails late
             client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
-            raise OptionError(f"there is no dask scheduler at {scheduler}") from error
+            raise OptionError(
+                f"there is no dask scheduler at {scheduler}; an address is tcp://HOST:PORT"
+            ) from error
         return stack.enter_context(client)
     folder = stack.enter_context(
         tempfile.TemporaryDirectory(prefix="megloc-", ignore_cleanup_errors=True)
