@@ -145,7 +145,10 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
             413, f"the image has more than {max_megapixels:g} megapixels"
         ) from error
     except Exception as error:  # pillow raises many kinds of errors for broken headers
-        raise HTTPException(415, "the image is neither JPEG nor PNG, or broken") from error
+        reason = "the image is neither JPEG nor PNG, or broken"
+        if content.startswith((b"/9j/", b"iVBOR", b"data:")):
+            reason += "; this is base64: send the bytes of the file"
+        raise HTTPException(415, reason) from error
     width, height = image.size
     if width * height > max_megapixels * 1e6:
         raise HTTPException(

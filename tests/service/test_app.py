@@ -7,6 +7,7 @@ import itertools
 import json
 import re
 import threading
+from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -172,6 +173,7 @@ def test_invalid_cameras_are_refused(
     "content, status, words",
     [
         (b"", 415, "neither JPEG nor PNG"),
+        (b64encode(picture(400, 300, "JPEG")), 415, "base64: send the bytes"),
         (b"<svg xmlns='http://www.w3.org/2000/svg'/>", 415, "neither"),
         (picture(400, 300, "JPEG")[:9000], 422, "broken"),
         (picture(1200, 1000), 413, "1200x1000, which is more than 1 megapixels"),
