@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import reduced_size
-from megloc_kapture.io.images import is_image, read_image_rgb
+from megloc_kapture.io.images import image_size, is_image, read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
 from megloc_kapture.preprocessing.frames import resized, scaled_camera
@@ -76,6 +76,8 @@ class PosedPairs:
         poses, records = data.poses(), depth_records(data)
         self._poses = poses
         self._names = [name for name in sorted(poses) if name in records]
+        for name in self._names:  # a missing image would end the training when it is drawn
+            image_size(folder.image_path(name))
         self._view = lru_cache(maxsize=_VIEWS_KEPT)(self._read_view)
         if measured is not None and measured.is_file():
             near, overlaps = self._read_overlaps(measured)

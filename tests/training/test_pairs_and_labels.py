@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,6 +109,10 @@ def test_invalid_training_data_is_refused(
         DataError, match=r"no pair of images overlaps by 0\.98 to 0\.99; the 10 candidate pairs"
     ):
         PosedPairs(KaptureFolder(walk), SMALL)
+    shutil.copytree(walk, tmp_path / "holes")
+    (tmp_path / "holes" / "sensors" / "records_data" / "2.png").unlink()
+    with pytest.raises(DataError, match=r"2\.png: no such image"):
+        PosedPairs(KaptureFolder(tmp_path / "holes"), SMALL)
     with pytest.raises(DataError, match="no such folder"):
         Photographs(tmp_path / "nowhere", SMALL)
     (tmp_path / "empty").mkdir()
