@@ -97,7 +97,8 @@ def network_input(
     descriptors = np.asarray(image.descriptors, dtype=np.float32)
     if table.ndim != 2 or table.shape[1] < 3:
         raise DataError(
-            f"SuperGlue needs keypoints (N, 3) of x, y, score; these have the shape {table.shape}"
+            f"SuperGlue needs keypoints (N, 3) of x, y, score; these have the shape {table.shape} "
+            "(superpoint, aliked and xfeat store scores)"
         )
     scores = table[:, 2]
     if not ((scores > 0) & (scores <= 1)).all():
