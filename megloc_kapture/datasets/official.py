@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path, PurePosixPath
 
 from megloc_kapture.datasets.kapture_folders import (
@@ -49,8 +50,15 @@ class DatasetCard(Options):
     layout: str
 
     def without(self, root: Path, absent: Sequence[str]) -> DataError:
-        near = root.parent, *(path.parent for path in sorted(root.glob(f"*/{absent[0]}")))
-        found = next((path for path in near if all((path / n).is_dir() for n in absent)), None)
+        inner = sorted(path for path in root.glob("*") if path.is_dir())
+        near = (path for path in (root.parent, *inner) if all((path / n).is_dir() for n in absent))
+        forms = (
+            path
+            for path in inner
+            for with_locations in (False, True)
+            if KaptureForm.find(path, with_locations=with_locations)
+        )
+        found = next(chain(near, forms), None)
         packed = next((f"; is {path} extracted?" for path in archives(root)), "")
         remedy = f"the root must contain {self.layout}{packed}"
         if found is not None:
@@ -279,8 +287,12 @@ class KaptureForm:
         The size of one image per camera and folder is checked.
         """
         images: dict[str, KaptureImage] = {}
+        if all(path.name == "mapping" for path in self.folders):
+            missing.files.append(self.folders[0].with_name("query"))
         for path in self.folders:
             folder = KaptureFolder(path)
+            if path.name == "mapping":
+                missing.require(path / "sensors" / "trajectories.txt")
             data = folder.read()
             number = path.parent.name
             locations = (f"{int(number):03d}",) if number.isdecimal() else ()

@@ -252,6 +252,8 @@ def test_kapture_folders_may_be_in_a_subfolder(
     place.mkdir()
     (place / "kapture").symlink_to(kapture_form)
     assert_same_dataset(read(place), read(official))
+    with pytest.raises(DataError, match=f"there is one in {place}/: give it as the root"):
+        read(tmp_path)
     monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
     choice = choose_dataset("aachen", None)
     choice.check()
@@ -273,6 +275,15 @@ def test_the_name_of_the_pose_file_follows_the_version(kapture_form: Path, form_
     assert read(form_copy, version="1.1").protocol.pose_file_stem == "Aachen_v1_1"
     named = form_copy.rename(form_copy.with_name("Aachen-Day-Night-v1.1"))
     assert read(named).protocol.pose_file_stem == "Aachen_v1_1"
+
+
+def test_missing_parts_of_the_kapture_form_are_named(form_copy: Path) -> None:
+    (form_copy / "mapping" / "sensors" / "trajectories.txt").unlink()
+    for part in ("query_day", "query_night"):
+        shutil.rmtree(form_copy / part)
+    missing = read(form_copy).missing
+    assert missing is not None
+    assert missing.by_folder() == ["query", "mapping/sensors/trajectories.txt"]
 
 
 def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
