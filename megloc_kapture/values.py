@@ -172,7 +172,13 @@ class RigidTransform:
         cls, rotation: NDArray[np.float64], translation: NDArray[np.float64]
     ) -> RigidTransform:
         """Create a transform from a rotation matrix (3, 3) and a translation (3,)."""
-        (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
+        matrix = np.asarray(rotation, dtype=np.float64)
+        if matrix.shape != (3, 3):
+            raise DataError(f"a rotation matrix has the shape (3, 3), got {matrix.shape}")
+        is_orthonormal = np.allclose(matrix.T @ matrix, np.eye(3), rtol=0, atol=0.01)
+        if not is_orthonormal or np.linalg.det(matrix) < 0:
+            raise DataError(f"not a rotation matrix: {matrix.tolist()}")
+        (a, b, c), (d, e, f), (g, h, i) = matrix
         # the quaternion is the eigenvector of the largest eigenvalue of a symmetric 4x4 matrix;
         # this is numerically stable for every rotation
         k = np.array(

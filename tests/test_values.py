@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -68,6 +69,21 @@ def test_from_matrix_is_stable_everywhere(axis: list[float], angle: float) -> No
     assert abs(np.linalg.norm(transform.quat_wxyz) - 1) < 1e-15
     assert transform.quat_wxyz[0] >= 0
     assert transform.translation == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.eye(4), r"has the shape \(3, 3\), got \(4, 4\)"),
+        (np.diag([1.0, 1.0, -1.0]), "not a rotation matrix"),
+        (2 * np.eye(3), "not a rotation matrix"),
+        (np.ones((3, 3)), "not a rotation matrix"),
+        (np.full((3, 3), np.nan), "not a rotation matrix"),
+    ],
+)
+def test_other_matrices_are_no_rotations(matrix: NDArray[np.float64], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        RigidTransform.from_matrix(matrix, np.zeros(3))
 
 
 def test_a_camera_takes_numbers_of_any_kind() -> None:
