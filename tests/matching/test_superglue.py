@@ -116,7 +116,7 @@ def test_unusable_features_are_named(weights: Path) -> None:
     good = image(9, 0)
     plugin = matcher(weights)
     bare = ImageFeatures(good.keypoints_px[:, :2], good.descriptors, 640, 480)
-    with pytest.raises(DataError, match=r"x, y, score.*\(9, 2\)"):
+    with pytest.raises(DataError, match=r"x, y, score.*\(9, 2\) \(superpoint"):
         plugin.match(good, bare)
     for value in (0.0, 1.5, -0.2, np.nan):
         table = good.keypoints_px.copy()
