@@ -96,6 +96,8 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     lines, comments and a header that names the columns are accepted.
     """
     text = read_text(path)
+    if text.startswith("# kapture format"):
+        raise DataError("a file of a kapture folder; give the folder", path=path)
     if not is_colmap_images(text):
         rows = _in_column_order(_rows(text))
     else:

@@ -139,6 +139,13 @@ def test_broken_lines_are_named(
     assert caught.value.line == 3 and str(caught.value).startswith(f"{path}:3: ")
 
 
+def test_a_file_of_a_kapture_folder_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "trajectories.txt"
+    path.write_text("# kapture format: 1.1\n1, cam, 1, 0, 0, 0, 1, 2, 3\n")
+    with pytest.raises(DataError, match="a file of a kapture folder; give the folder"):
+        read_pose_file(path)
+
+
 def test_short_names_are_matched_with_images() -> None:
     images = ["q/day/1.jpg", "q/day/2.jpg", "q/night/2.jpg"]
     result = poses_by_image({"1.jpg": HERE, "q/day/2.jpg": HERE, "9.jpg": HERE}, images)
