@@ -235,7 +235,9 @@ def _by_names_of_results(
     if not images & true_poses.keys():
         true_poses = poses_by_image(true_poses, images)
     for result in results:
-        if result.poses and not (true_poses.keys() | known) & set(result.images):
+        # queries that failed are in status.csv only
+        names = {*result.images, *result.statuses}
+        if result.poses and not (true_poses.keys() | known) & names:
             raise DataError(
                 f"no name fits: the result has {min(result.images)!r}, the truth "
                 f"{min(true_poses, default='nothing')!r}"

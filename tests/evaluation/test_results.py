@@ -251,6 +251,16 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
         evaluate({"a.jpg": np.eye(4)}, truth)  # type: ignore[dict-item]
 
 
+def test_a_result_with_poses_of_other_images_only_is_a_miss(
+    world: Any, truth: Path, tmp_path: Path
+) -> None:
+    other = {"left.jpg": RigidTransform.identity()}  # not evaluated, as RobotCar's side cameras
+    folder = write_kapture(tmp_path / "localized", list(other), other)
+    write_status(folder / "status.csv", [Failure("-", name=name) for name in world.truth])
+    row = evaluate(folder, truth).row()
+    assert (row.num_queries, row.num_localized) == (len(world.truth), 0)
+
+
 def test_folders_without_usable_poses_are_refused(
     result: Path, truth: Path, tmp_path: Path
 ) -> None:
