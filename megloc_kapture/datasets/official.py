@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path, PurePosixPath
 
 from megloc_kapture.datasets.kapture_folders import (
@@ -49,21 +48,30 @@ class DatasetCard(Options):
     folders: tuple[str, ...]
     layout: str
 
-    def without(self, root: Path, absent: Sequence[str]) -> DataError:
-        inner = sorted(path for path in root.glob("*") if path.is_dir())
-        near = (path for path in (root.parent, *inner) if all((path / n).is_dir() for n in absent))
-        forms = (
-            path
-            for path in inner
-            for with_locations in (False, True)
-            if KaptureForm.find(path, with_locations=with_locations)
+    def without(
+        self, root: Path, absent: Sequence[str], *, with_locations: bool = False
+    ) -> DataError:
+        near = root.parent, *sorted(path for path in root.glob("*") if path.is_dir())
+        found = next(
+            (
+                path
+                for path in near
+                if all((path / name).is_dir() for name in absent)
+                or KaptureForm.find(path, with_locations=with_locations)
+            ),
+            None,
         )
-        found = next(chain(near, forms), None)
         packed = next((f"; is {path} extracted?" for path in archives(root)), "")
         remedy = f"the root must contain {self.layout}{packed}"
         if found is not None:
             remedy = f"there is one in {found}/: give it as the root"
         return DataError(f"not {self.title}, no folder {' and '.join(absent)}; {remedy}", path=root)
+
+
+def kapture_hint(root: Path) -> str:
+    """Return the remedy for kapture folders of a dataset that is read in its layout only."""
+    has_map = is_kapture(root / MAPPING)
+    return "; kapture folders can be evaluated as dataset kapture" if has_map else ""
 
 
 def archives(root: Path) -> list[Path]:

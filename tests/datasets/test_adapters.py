@@ -14,7 +14,7 @@ from robotcar_files import ts, write_layout
 
 from megloc_kapture.datasets.official import Count, write_official
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DATASETS
 
@@ -82,6 +82,23 @@ def test_a_folder_inside_the_layout_names_the_layout(layouts: Path, inside: str)
     dataset = inside.partition("/")[0]
     with pytest.raises(DataError, match=f"there is one in .*{dataset}/: give it as the root"):
         load_plugin(DATASETS, dataset, {}).check(layouts / inside)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "mapping", "hint"),
+    [
+        ("robotcar", "Seasons-v2/01/mapping", "there is one in .*Seasons-v2/: give it as the root"),
+        ("robotcar", "1/mapping", "the root must contain"),
+        ("4seasons", "mapping", "no recording here.*can be evaluated as dataset kapture"),
+        ("inloc", "mapping", "cutouts/ is missing.*can be evaluated as dataset kapture"),
+    ],
+)
+def test_kapture_folders_in_another_place_are_named(
+    tmp_path: Path, dataset: str, mapping: str, hint: str
+) -> None:
+    write_sensors(tmp_path / mapping, KaptureData())
+    with pytest.raises(DataError, match=hint):
+        load_plugin(DATASETS, dataset, {}).read(tmp_path)
 
 
 def test_an_archive_in_place_of_a_folder_is_named(layouts: Path, tmp_path: Path) -> None:

@@ -89,6 +89,8 @@ def test_empty_and_binary_files_are_named(tmp_path: Path, reader: Reader) -> Non
         (read_transform, "1 0 0 2.0", "2 0 0 2.0", None, "not a rotation"),
         (fourseasons.read_poses, "0 0.6", "", 1, "expected finite numbers tx ty tz"),
         (fourseasons.read_poses, "0.6 0 0.8", "0 0 0", 1, "not a unit quaternion"),
+        (fourseasons.read_poses, f"{TIME} ", f"{TIME}.0 ", 1, ".0' is not a timestamp"),
+        (fourseasons.read_relocalization, " 1\n", "\n", 1, "1 columns instead of 2 or 9"),
         (robotcar.read_intrinsics, "cy 4", "cz 4", None, "cy missing"),
         (robotcar.read_query_location, "dawn/rear", "../a/rear", 2, "expected condition/camera"),
         (robotcar.read_train_poses, "10.0", "x", 1, "could not convert string to float: 'x'"),

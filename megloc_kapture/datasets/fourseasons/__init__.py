@@ -13,9 +13,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
-from megloc_kapture.datasets.official import Missing
+from megloc_kapture.datasets.official import Missing, kapture_hint
 from megloc_kapture.errors import DataError, OptionError, require
-from megloc_kapture.evaluation.pose_files import RelativePoses
+from megloc_kapture.evaluation.pose_files import RelativePoses, parse_timestamp
 from megloc_kapture.io.files import named
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.io.text_lines import fields_of, numbers_of, read_transform, reading_lines
@@ -93,7 +93,7 @@ def _by_timestamp(path: Path, parse: Callable[[list[str]], Row]) -> dict[int, Ro
     rows: dict[int, Row] = {}
     with reading_lines(path, comments=True) as lines:
         for timestamp, *fields in map(fields_of, lines):
-            rows[int(timestamp)] = parse(fields)
+            rows[parse_timestamp(timestamp)] = parse(fields)
     return rows
 
 
@@ -137,9 +137,10 @@ def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
 def read_relocalization(path: Path) -> RelativePoses:
     rows: RelativePoses = {}
     with reading_lines(path, comments=True) as lines:
-        for first, second, *fields in map(fields_of, lines):
-            reference, query = int(first), int(second)
-            pose = _transform(fields) if fields else None
+        for fields in map(fields_of, lines):
+            require(len(fields) in (2, 9), f"{len(fields)} columns instead of 2 or 9")
+            reference, query = map(parse_timestamp, fields[:2])
+            pose = _transform(fields[2:]) if fields[2:] else None
             rows.setdefault((reference, query), pose)
     return rows
 
@@ -220,7 +221,7 @@ def find_recordings(root: Path) -> dict[str, Recording]:
     if not recordings:
         found = next(root.glob(f"*/*/{_IMAGES}"), root.resolve() / _IMAGES)
         found_in = f"; there is one in {found.parent.parent}/: give it as the root"
-        hint = found_in if found.exists() else ""
+        hint = found_in if found.exists() else kapture_hint(root)
         reason = f"no recording here (a folder with {_IMAGES}/ or {GNSS_POSES}){hint}"
         raise DataError(reason, path=root)
     return recordings

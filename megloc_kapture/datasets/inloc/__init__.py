@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.official import Missing
+from megloc_kapture.datasets.official import Missing, kapture_hint
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import named, read_text, reading
 from megloc_kapture.io.text_lines import reading_lines, transform_of
@@ -142,7 +142,8 @@ class Layout:
                 absent = (_ALIGNMENTS if alignments is None else _QUERIES)[0]
                 raise DataError(f"{absent}/ is missing; the layout of InLoc is {LAYOUT}", path=root)
             return cls(cutouts, alignments, query)
-        raise DataError(f"{_CUTOUTS[0]}/ is missing; the layout of InLoc is {LAYOUT}", path=root)
+        reason = f"{_CUTOUTS[0]}/ is missing; the layout of InLoc is {LAYOUT}{kapture_hint(root)}"
+        raise DataError(reason, path=root)
 
     def queries(self, missing: Missing) -> list[str]:
         names = [name for name in _listed(self.query) if name.lower().endswith(_PHOTOGRAPH)]

@@ -127,7 +127,7 @@ class RobotCar:
             if self.options.reference_model:
                 raise form.without_model()
         elif absent := Layout(root).absent():
-            raise self.card.without(root, absent)
+            raise self.card.without(root, absent, with_locations=True)
         elif self.options.reference_model:
             check_model_files(Layout(root).points_files(self.options.model))
 
