@@ -51,7 +51,9 @@ class DatasetCard(Options):
     def without(
         self, root: Path, absent: Sequence[str], *, with_locations: bool = False
     ) -> DataError:
-        near = root.parent, *sorted(path for path in root.glob("*") if path.is_dir())
+        folders = (path for path in root.glob("*") if path.is_dir())
+        imported = {path.parent for path in root.glob(f"*/{SIDE_TABLES}")}
+        near = root.parent, *sorted(set(folders) - imported - {root / GROUND_TRUTH})
         found = next(
             (
                 path

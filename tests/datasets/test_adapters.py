@@ -105,6 +105,9 @@ def test_an_archive_in_place_of_a_folder_is_named(layouts: Path, tmp_path: Path)
     root = without(layouts, "aachen", tmp_path, "images_upright")
     (root / "images").mkdir()
     (root / "images" / "database_and_query_images.zip").touch()
+    for other in ("imported", "ground_truth"):
+        write_sensors(root / other / "mapping", KaptureData())
+    (root / "imported" / "megloc").mkdir()
     message = "; is images/database_and_query_images.zip extracted[?]"
     with pytest.raises(DataError, match=message):
         load_plugin(DATASETS, "aachen", {}).check(root)
