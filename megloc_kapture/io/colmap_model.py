@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import mmap
+import re
 import struct
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,12 +21,17 @@ from megloc_kapture.io.colmap import load_pycolmap, quiet_stderr
 from megloc_kapture.io.files import TEMPORARY, check_relative, named, read_text, reading
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.kapture.sensors import unit_quaternion
-from megloc_kapture.io.text_lines import numbers_of, read_camera_rows
+from megloc_kapture.io.text_lines import numbers_of, read_camera_rows, reading_lines
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
+
+_log = logging.getLogger(__name__)
 
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 IMAGE_COLUMNS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_POINT_COLUMNS = "POINT3D_ID X Y Z R G B ERROR"
+# an image size in cameras.txt, written as float by scripts: 1920.0 1080.0
+_SIZE = re.compile(r"^(\s*\d+\s+\w+\s+\d+)\.0*(\s+\d+)\.0*(?=\s)", re.MULTILINE)
 _RIG_FILES = ("rigs", "frames")  # since COLMAP 3.12
 # models that kapture lacks: an equivalent with distortion, and the number of zeros to append
 _SAME_AS = {"SIMPLE_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", 1), "FISHEYE": ("OPENCV_FISHEYE", 4)}
@@ -118,16 +125,20 @@ def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path,
             f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here", path=folder
         )
     paths = [folder / name for name in (names if with_points else names[:2])]
+    for path in paths:
+        remedy = "; an empty file is a model of poses only" if path.name == "points3D.txt" else ""
+        require(path.is_file(), f"file is missing{remedy}", path=path)
     more = [folder / f"{name}{paths[0].suffix}" for name in _RIG_FILES]
     return (*paths, *(path for path in more if path.exists()))
 
 
 def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
-    """Read the model of a folder; without points, their file need not exist."""
+    """Read the model of a folder; without points, their file need not exist.
+
+    Points whose tracks name images or features that the model lacks are ignored, with a warning.
+    """
     paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
-        remedy = "; an empty file is a model of poses only" if path.name == "points3D.txt" else ""
-        require(path.is_file(), f"file is missing{remedy}", path=path)
         if path.name in _RECORDS:
             _check_complete(path)
     names: dict[int, str] = {}
@@ -137,8 +148,8 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
             if path.name == TEXT_FILES[1]:
                 text, names = _images_for_pycolmap(path, paths[0])
                 link.write_text(text, encoding="utf-8")
-            elif path.suffix == ".txt":
-                link.write_text(read_text(path), encoding="utf-8")  # without a byte order mark
+            elif path.suffix == ".txt":  # without a byte order mark
+                link.write_text(_SIZE.sub(r"\1\2", read_text(path)), encoding="utf-8")
             else:
                 link.symlink_to(path.resolve())
         if not with_points:
@@ -148,10 +159,20 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
         with reading(folder, f"a model that COLMAP can read ({files})"), quiet_stderr():
             try:
                 model = load_pycolmap().Reconstruction(links)
-            except Exception:
+            except Exception as error:
                 if names:
                     read_camera_rows(paths[0])  # names the line of a wrong camera
-                raise
+                if not with_points:
+                    raise
+                if not isinstance(error, IndexError):
+                    if names:
+                        _check_point_rows(paths[2])
+                    raise
+                model = None
+    if model is None:
+        message = "%s: ignored, as its tracks name images or features that %s lacks"
+        _log.warning(message, paths[2], paths[1].name)
+        return read_colmap_model(folder, with_points=False)
     cameras = {camera_id: _camera(camera, paths[0]) for camera_id, camera in model.cameras.items()}
     if paths[0].suffix == ".bin":
         size = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
@@ -206,6 +227,15 @@ def _images_for_pycolmap(path: Path, cameras: Path) -> tuple[str, dict[int, str]
         names[image_id] = row[9]
         lines.append(f"{' '.join(row[:9])} {image_id}\n{features}\n")
     return "".join(lines), names
+
+
+def _check_point_rows(path: Path) -> None:
+    with reading_lines(path, comments=True) as lines:
+        for line in lines:
+            fields = line.split()
+            numbers_of(fields[:8], _POINT_COLUMNS)
+            colour = " ".join(fields[4:7])
+            require(colour.replace(" ", "").isdigit(), f"R G B {colour!r} are not whole numbers")
 
 
 def _check_complete(path: Path) -> None:

@@ -220,8 +220,9 @@ def test_binary_files_take_precedence_over_text_and_poses_need_no_points(tmp_pat
     (tmp_path / "points3D.bin").unlink()
     poses = read_colmap_model(tmp_path, with_points=False)
     assert (poses.cameras, poses.images, len(poses.points)) == (SMALL.cameras, SMALL.images, 0)
-    with pytest.raises(DataError, match=r"points3D\.bin: file is missing"):
-        read_colmap_model(tmp_path)
+    for read in (read_colmap_model, colmap_model_files):
+        with pytest.raises(DataError, match=r"points3D\.bin: file is missing"):
+            read(tmp_path)
     names = ("cameras.bin", "images.bin")
     assert colmap_model_files(tmp_path, with_points=False) == tuple(tmp_path / n for n in names)
 
@@ -243,6 +244,8 @@ IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n\n8 1 0 0 0 0 0 0 1 db/8.jpg\n\n"
         ("images", "7 1 0 0 0", "7 0 0 0 0", "images.txt: image 'db/7.jpg': .*quaternion"),
         ("images", "db/7", "../7", "images.txt: image '../7.jpg': .*leads out"),
         ("images", "db/8", "db/7", "'db/7.jpg': is listed twice"),
+        ("points3D", "", "1 2 3 4 5 6 7", "points3D.txt:1: expected finite numbers POINT3D_ID"),
+        ("points3D", "", "1 2 3 4 .5 .6 0 1", "points3D.txt:1: R G B '.5 .6 0' are not whole"),
     ],
 )
 def test_a_wrong_text_model_is_named(
@@ -274,6 +277,26 @@ def test_images_of_other_tools_are_read(tmp_path: Path, change: Callable[[str], 
     names = [image.name for image in read_colmap_model(tmp_path).images]
     assert [name[-5:].removesuffix(".jpg")[-1] for name in names] == ["7", "8"]
     assert len({name.rpartition("/")[0] for name in names} & {"db", "my photos/day 1"}) == 1
+
+
+def test_image_sizes_written_as_floats_are_read(tmp_path: Path) -> None:
+    cameras = CAMERAS.replace("1600 1067", "1600.0 1067.")
+    for file, text in (("cameras", cameras), ("images", IMAGES), ("points3D", "")):
+        (tmp_path / f"{file}.txt").write_text(text)
+    (camera,) = read_colmap_model(tmp_path).cameras.values()
+    assert (camera.width, camera.height, camera.params[0]) == (1600, 1067, 1084.6)
+
+
+@pytest.mark.parametrize("track", ["7 0", "9 0"], ids=["feature", "image"])
+def test_points_of_missing_features_are_ignored(
+    tmp_path: Path, track: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    points = f"1 0 0 5 1 2 3 0 {track}\n"
+    for file, text in (("cameras", CAMERAS), ("images", IMAGES), ("points3D", points)):
+        (tmp_path / f"{file}.txt").write_text(text)
+    model = read_colmap_model(tmp_path)
+    assert len(model.images) == 2 and not len(model.points)
+    assert "points3D.txt: ignored, as its tracks name images or features" in caplog.text
 
 
 def test_backslashes_in_binary_files_separate_folders(tmp_path: Path) -> None:
