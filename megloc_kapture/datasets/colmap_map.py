@@ -42,6 +42,10 @@ from megloc_kapture.values import Camera
 
 SPARSE, IMAGES, DATABASE = "sparse", "images", "database.db"
 _log = logging.getLogger(__name__)
+_OTHER_DATABASE = (
+    "give the database of this model with `megloc import colmap --database`, or rename this one: "
+    "SIFT is then extracted from the images"
+)
 _MAPPED_AGAIN = "%s: %s; its images are mapped again with its poses"
 
 _SIFT = "sift"
@@ -212,15 +216,25 @@ class ColmapReconstruction:
             return None
         if local_type is None:
             return self._write_with_sift(output, work)
-        counts = self._write_reference(
-            output, keypoints_type=local_type, database=source.database, database_names=self.renamed
-        )
-        folder = KaptureFolder(output)
-        descriptors = folder.descriptors(local_type)
-        for image in folder.keypoints(local_type).names:
-            require(
-                image in descriptors, f"image {image!r} has no descriptors", path=source.database
+        try:
+            counts = self._write_reference(
+                output,
+                keypoints_type=local_type,
+                database=source.database,
+                database_names=self.renamed,
             )
+            folder = KaptureFolder(output)
+            descriptors = folder.descriptors(local_type)
+            for image in folder.keypoints(local_type).names:
+                require(
+                    image in descriptors,
+                    f"image {image!r} has no descriptors",
+                    path=source.database,
+                )
+        except DataError as error:
+            if error.path != source.database:
+                raise
+            raise DataError(f"{error.message}; {_OTHER_DATABASE}", path=error.path) from error
         return counts
 
     def _write_with_sift(self, output: Path, work: Work) -> dict[str, float] | None:

@@ -83,8 +83,14 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         return np.empty((0, 2), np.float32) if rows is None else np.ascontiguousarray(rows[:, :2])
 
     def feature_type(self) -> tuple[str, str] | None:
-        """Return type name and dtype of all features, or None without descriptors."""
+        """Return type name and dtype of all features, or None without descriptors.
+
+        Tools that match by themselves store zeros in place of descriptors.
+        """
         with self._reading():
+            first = next(self._rows("SELECT data FROM descriptors WHERE rows > 0"), None)
+            if first is not None and not any(first[0]):
+                return None
             columns = self._rows("PRAGMA table_info(descriptors)")
             if any(column[1] == "type" for column in columns):
                 rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")

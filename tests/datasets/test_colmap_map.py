@@ -256,6 +256,12 @@ def test_without_features_or_images_the_import_is_refused(room: Path, tmp_path: 
     assert list(output.iterdir()) == []
 
 
+def test_a_database_that_does_not_fit_may_be_set_aside(room: Path, tmp_path: Path) -> None:
+    execute(room, "UPDATE images SET name = 'images/' || name")
+    with pytest.raises(DataError, match=r"database.db: has no image '000.*; give .*or rename"):
+        import_colmap(find_colmap(room), tmp_path / "map")
+
+
 def test_a_missing_image_is_tolerated_where_the_database_has_its_features(
     room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -477,6 +483,15 @@ def test_backslashes_in_a_database_separate_folders(tmp_path: Path) -> None:
     write_database(tmp_path / "d.db", {"db\\a.jpg": 10})
     with ColmapDatabase(tmp_path / "d.db") as database:
         assert list(database.images) == ["db/a.jpg"]
+
+
+def test_zeros_in_a_database_are_no_descriptors(tmp_path: Path) -> None:
+    write_database(tmp_path / "d.db", FEATURES)
+    with sqlite3.connect(tmp_path / "d.db") as connection:
+        connection.execute("UPDATE descriptors SET data = zeroblob(length(data))")
+    connection.close()
+    with ColmapDatabase(tmp_path / "d.db") as database:
+        assert database.feature_type() is None
 
 
 def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> None:
