@@ -108,7 +108,7 @@ class Import(Common):
     def _import_colmap(self) -> None:
         source = find_colmap(self.root, images=self.images, database=self.database)
         with (
-            staged_output(self.output, kind=MAP, force=self.force) as out,
+            staged_output(self.output, kind=MAP, force=self.force, inputs=[self.root]) as out,
             open_executor("processes") as executor,
         ):
             work = Work(executor, self.track, force=self.force)

@@ -104,7 +104,7 @@ class Localize(Reading, Deciding, Common):
                 f"{min(names)}, {min(images)}, 1.0",
                 path=self.pairs,
             )
-        inputs = (path, self.query)
+        inputs = (path, self.input, self.query, *self.images)
         with staged_output(self.output, kind=LOCALIZED, force=self.force, inputs=inputs) as out:
             started = time.perf_counter()
             outcomes = list(results.items())

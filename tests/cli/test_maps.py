@@ -239,6 +239,18 @@ def test_a_model_is_imported_to_the_cache_where_a_map_is_expected(
     assert "unit              units of the map" in done.out
 
 
+def test_a_model_and_photographs_are_never_written_into(
+    megloc: Any, colmap_room: Path, scene: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    photos = scene / "query" / "sensors" / "records_data"
+    for output in (colmap_room, photos):
+        done = megloc("localize", "-i", colmap_room, "--images", photos, "-o", output, "-f")
+        assert done.status == 2 and f"{output}: is or contains an input" in done.err
+    done = megloc("import", "colmap", colmap_room, "-o", colmap_room, "-f")
+    assert done.status == 2 and "contains an input" in done.err
+
+
 def test_a_model_of_poses_alone_without_images_is_imported_as_poses(
     megloc: Any, colmap_room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
