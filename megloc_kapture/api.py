@@ -46,7 +46,7 @@ from megloc_kapture.pipeline.map_making import (
 )
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset, options_with
-from megloc_kapture.pipeline.queries import Query
+from megloc_kapture.pipeline.queries import Query, permitted_images
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.plugin_loading import load_plugin
@@ -213,7 +213,6 @@ def _query_of(
     prior: Sequence[str] | None,
 ) -> Query:
     name, orientation = "query", 1
-    permitted = None if prior is None else _as_tuple(prior)
     check_image(image)
     if isinstance(image, Path):
         name = image.name  # as in a list or a folder
@@ -227,7 +226,7 @@ def _query_of(
             camera, image = photo.upright_camera, turned_upright(image, photo.orientation)
     elif camera is None:
         camera = guessed_camera(image.shape[1], image.shape[0])
-    return Query(camera, image, name, prior=permitted, orientation=orientation)
+    return Query(camera, image, name, prior=permitted_images(prior), orientation=orientation)
 
 
 def open_map(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,11 @@ from megloc_kapture.stages.local_features import check_size, extract_all, read_m
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import ClassMasks, PreprocessingOptions, ProcessedFrame
 from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform, check_camera
+
+
+def permitted_images(prior: Sequence[str] | None) -> tuple[str, ...] | None:
+    """Return the names in a prior, which may be a single name."""
+    return (prior,) if isinstance(prior, str) else None if prior is None else tuple(prior)
 
 
 @dataclass(frozen=True, eq=False)

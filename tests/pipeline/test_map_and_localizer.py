@@ -298,6 +298,7 @@ def test_a_prior_restricts_the_candidates(
     found = localizer.localize(image, camera, prior=["0003.jpg", "0005.jpg", "0003.jpg"])
     assert set(found.candidates) == {"0003.jpg", "0005.jpg"}
     assert errors(found, truth.cam_from_world("0004.jpg"))[0] < 0.05
+    assert localizer.localize(image, camera, prior="0003.jpg").candidates == ("0003.jpg",)
     assert localizer.localize(image, camera, prior=[]) == Failure("no map image is a candidate")
     with pytest.raises(DataError, match=r"0004\.jpg has the candidate 0001\.jpg, which is not"):
         localizer.localize(image, camera, prior=["0003.jpg", "0001.jpg"])
