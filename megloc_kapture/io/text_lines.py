@@ -127,7 +127,7 @@ def read_camera_rows(path: Path) -> dict[str, Camera]:
                     "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "
                     f"{', '.join(CAMERA_MODEL_NUM_PARAMS)}"
                 )
-            name = check_relative(row["name"])
+            name = check_relative(row["name"].removeprefix("./"))
             require(name not in cameras, f"{name!r} is listed twice")
             width, height, *params = map(float, fields_of(row["numbers"]))
             require((width % 1, height % 1) == (0, 0), "the image size is not in whole pixels")

@@ -353,7 +353,7 @@ class Photographs(Queries):
                 self.unreadable[name] = error.message
         self.names = sorted(self._photos)
         warn_of_scaled(roots[0], self._scaled)
-        if self.names and self.without_row == self.names:
+        if self.names and len(self.without_row) == len(self._photos) + len(self.unreadable):
             raise OptionError(
                 f"the list of cameras names none of the images, for example {self.names[0]}: the "
                 "first field of each row is an image name"
@@ -423,9 +423,9 @@ class Photographs(Queries):
         if isinstance(given, Mapping):
             camera = find_camera(given, name, path)
         if camera is None:
-            self._photos[name], self._paths[name] = read_photo(path), path
             if given is not None:
                 self.without_row.append(name)
+            self._photos[name], self._paths[name] = read_photo(path), path
             return
         size = image_size(path)
         if size != (camera.width, camera.height) and is_scaled(camera, size):

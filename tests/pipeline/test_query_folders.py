@@ -134,7 +134,7 @@ def test_a_list_has_the_camera_of_each_image(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text(
         "# NAME MODEL WIDTH HEIGHT PARAMS\n"
         "query/day/1.jpg PINHOLE 64 48 51 51 32 24\n"
-        "query/night/1.jpg PINHOLE 64.0 48.0 52 52 32 24\n"
+        "./query/night/1.jpg PINHOLE 64.0 48.0 52 52 32 24\n"
         "query/day/2 b.jpg, SIMPLE_RADIAL, 128, 96, 106, 64, 48, 0.1\n"
     )
     cameras = read_cameras(tmp_path / "cameras.txt")
@@ -151,6 +151,9 @@ def test_a_list_has_the_camera_of_each_image(tmp_path: Path) -> None:
     assert Photographs([tmp_path / "query" / "day"], cameras).query("1.jpg").camera.params[0] == 51
     with pytest.raises(OptionError, match=r"none of the images, for example 3\.jpg"):
         Photographs([tmp_path / "query" / "other"], cameras)
+    # the only listed image is of another shape than its camera
+    turned = {"day/1.jpg": Camera("PINHOLE", 48, 64, (51, 51, 24, 32))}
+    assert list(Photographs([tmp_path / "query"], turned).unreadable) == ["day/1.jpg"]
     # COLMAP's cameras.txt with one camera
     (tmp_path / "cameras.txt").write_text("# Camera list\n1 PINHOLE 64 48 50 50 32 24\n")
     photos = Photographs([tmp_path / "query"], read_cameras(tmp_path / "cameras.txt"))
