@@ -180,18 +180,20 @@ def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
 def describe_descriptors(
     opened: KaptureMap, keypoints: MapKeypoints, extractor: PluginChoice | None
 ) -> str:
-    if keypoints.has_descriptors(opened.images):
+    lacking = keypoints.without_descriptors(opened.images)
+    if not lacking:
         return "present"
+    of_images = f"missing for {len(lacking)} images, such as {lacking[0]}"
     if extractor is None:
-        return "missing, and no extractor for the type is installed: localization is not possible"
+        return f"{of_images}; no extractor for the type is installed: localization is not possible"
     if not opened.has_images():
-        return "missing, and no images to extract them from: localization is not possible"
-    return f"missing; will be extracted again by plugin {extractor.name}"
+        return f"{of_images}; no images to extract them from: localization is not possible"
+    return f"{of_images}; all will be extracted again by plugin {extractor.name}"
 
 
 def describe_retrieval(opened: KaptureMap) -> None:
     for keypoints in opened.keypoints.values():
-        missing = not keypoints.has_descriptors(opened.images)
+        missing = keypoints.without_descriptors(opened.images)
         if missing and not (keypoints.extractor() and opened.has_images()):
             line("retrieval", "not possible without the map's descriptors")
             return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -61,12 +61,12 @@ class MapKeypoints:
         """Return the stored descriptors (N, D) of a map image."""
         return np.asarray(self.stored_descriptors.read(image))
 
-    def has_descriptors(self, images: Collection[str]) -> bool:
+    def without_descriptors(self, images: Iterable[str]) -> list[str]:
+        """Return the images that have keypoints but no descriptors."""
+        with_keypoints = [image for image in images if image in self.stored_keypoints]
         if self.name not in self.folder.types("descriptors"):
-            return False
-        return all(
-            image in self.stored_descriptors for image in images if image in self.stored_keypoints
-        )
+            return with_keypoints
+        return [image for image in with_keypoints if image not in self.stored_descriptors]
 
     def extractor(self) -> PluginChoice | None:
         """Return the extractor plugin named by the type or its ``keypoints.txt``, or None."""
@@ -132,8 +132,8 @@ class KaptureMap:
         check_points(folder, "localize in")
         require(
             any(data.cam_from_world(image) is not None for image in data.image_names()),
-            "no image of the map has a pose: sensors/trajectories.txt is missing, or has other "
-            "timestamps or sensors than records_camera.txt",
+            "no image of the map has a pose: sensors/records_camera.txt or trajectories.txt is "
+            "missing, or they have other timestamps or sensors",
             path=folder.root,
         )
         indices = _read_indices(folder, keypoints_types)
@@ -197,7 +197,7 @@ class KaptureMap:
     def check(self) -> None:
         """Check the sizes of all feature files used for localization, without reading the files."""
         for keypoints in self.keypoints.values():
-            if not keypoints.has_descriptors(self.images):
+            if keypoints.without_descriptors(self.images):
                 continue
             for image in self.images:
                 if image in keypoints:

@@ -80,8 +80,13 @@ class LocalType:
 
     def prepare(self) -> None:
         """Extract missing map descriptors again; call this before matching."""
-        if not self.first.has_descriptors(self._map.images):
-            self._again = extract_again(self._map, self.first, self.extractor)
+        if lacking := self.first.without_descriptors(self._map.images):
+            try:
+                extractor = self.extractor
+            except DataError as error:
+                about = f"{len(lacking)} map images, such as {lacking[0]}, lack descriptors"
+                raise DataError(f"{about}: {error.message}", path=error.path) from error
+            self._again = extract_again(self._map, self.first, extractor)
 
     @property
     def name(self) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -231,8 +230,10 @@ def test_missing_features_that_no_plugin_extracts_are_named(megloc: Any, foreign
     (foreign / "query/reconstruction/keypoints/orb_800/0001.jpg.kpt").unlink()
     message = r"image '.*0001\.jpg': features of type 'orb_800' are missing and no extractor"
     megloc(*localize).refused(message)
-    shutil.rmtree(foreign / "map" / "reconstruction" / "descriptors")
-    megloc(*localize).refused(r"/map: .*'orb_800'", "no extractor")
+    (foreign / "map/reconstruction/descriptors/orb_800/0000.jpg.desc").unlink()
+    assert "missing for 1 images, such as 0000.jpg; " in megloc("info", foreign / "map").out
+    lacking = r"/map: 1 map images, such as 0000\.jpg, lack descriptors: .*'orb_800'"
+    megloc(*localize).refused(lacking, "no extractor")
     assert not output.exists()
 
 

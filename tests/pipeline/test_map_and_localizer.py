@@ -151,9 +151,9 @@ def test_unusable_maps_are_refused(workspace: Path, map_copy: Path, tmp_path: Pa
 def test_features_of_other_folders_are_used(workspace: Path, map_copy: Path) -> None:
     shutil.rmtree(map_copy / "reconstruction" / "descriptors")
     bare = KaptureMap.open(map_copy)
-    assert not bare.keypoints["rootsift"].has_descriptors(bare.images)
+    assert bare.keypoints["rootsift"].without_descriptors(bare.images) == bare.images
     opened = KaptureMap.open(map_copy, features_dirs=[workspace])
-    assert opened.keypoints["rootsift"].has_descriptors(opened.images)
+    assert not opened.keypoints["rootsift"].without_descriptors(opened.images)
     opened.check()
 
 

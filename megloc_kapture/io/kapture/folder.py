@@ -168,7 +168,11 @@ class KaptureFolder:
         if not folders:
             searched = ", ".join(str(root) for root, _ in candidates)
             present = ", ".join(self.types(kind)) or "none"
-            raise DataError(f"no {kind} of type {type_name!r} in {searched}; there are: {present}")
+            layout = "global_features" if kind == "global_features" else "local_features"
+            raise DataError(
+                f"no {kind} of type {type_name!r} in {searched}; there are: {present} "
+                f"(--features-dir FOLDER adds those in FOLDER/{layout}/{type_name}/{kind})"
+            )
         return folders
 
     def _check_descriptors(

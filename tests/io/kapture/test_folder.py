@@ -83,7 +83,7 @@ def test_an_unknown_type_is_refused_with_the_known_types(root: Path) -> None:
     reads = (folder.keypoints, folder.descriptors, folder.global_features, folder.matches)
     for read, present in zip(reads, "TTGT", strict=True):
         for name in ("X", "T/../T", ""):
-            with pytest.raises(DataError, match=f"there are: {present}"):
+            with pytest.raises(DataError, match=f"there are: {present} .--features-dir FOLDER"):
                 read(name)
 
 
