@@ -36,7 +36,7 @@ from megloc_kapture.errors import (
 from megloc_kapture.evaluation.view import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
 from megloc_kapture.io.colmap import MapImage, undistort_model, write_model
-from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.files import similar_name, write_bytes
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.points import write_ply
@@ -138,7 +138,12 @@ def export_nerfstudio(
 
 
 def _file_of(image: ExportedImage, who: str) -> Path:
-    require(image.path.is_file(), f"{who} needs the file of {image.name!r}", path=image.path)
+    require(
+        image.path.is_file(),
+        f"{who} needs the file of {image.name!r}{similar_name(image.path)}; those of a COLMAP "
+        "model are looked for in images/ next to sparse/",
+        path=image.path.resolve(),
+    )
     return image.path
 
 

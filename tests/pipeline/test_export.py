@@ -122,8 +122,10 @@ def test_images_that_a_format_cannot_store_are_refused(tmp_path: Path) -> None:
     pose = RigidTransform.identity()
     with pytest.raises(DataError, match="no camera model THIN_PRISM_FISHEYE; undistort"):
         export_nerfstudio([image(odd, pose, path=tmp_path / "a.jpg")], NO_POINTS, tmp_path)
-    with pytest.raises(DataError, match="needs the file"):
-        export_nerfstudio([image(Camera.pinhole(6, 4, 5), pose)], NO_POINTS, tmp_path)
+    (tmp_path / "records_data").symlink_to(tmp_path)
+    missing = image(Camera.pinhole(6, 4, 5), pose, path=tmp_path / "records_data" / "b.jpg")
+    with pytest.raises(DataError, match=f"{tmp_path}/b.jpg: nerfstudio needs the file"):
+        export_nerfstudio([missing], NO_POINTS, tmp_path)
     two = image(Camera.pinhole(6, 4, 5), pose), image(Camera.pinhole(6, 4, 5), pose)
     with pytest.raises(DataError, match="share a timestamp"):
         export_tum(two, tmp_path / "a.tum")
