@@ -112,9 +112,10 @@ def focal_misfit(
         return None
     given = problem.views[0].camera
     fit = _freed(problem, given, pose.cam_from_world, pose.inliers, options.max_error_px)
-    if fit is None or not fit.contradicts:
+    if fit is not None and not fit.contradicts:
         return None
-    # the inliers of a grossly wrong focal length favour it, so search again among all matches
+    # the inliers of a grossly wrong focal length favour it, or their fit does not converge, so
+    # search again among all matches
     free = focal_from_matches(
         problem.points_px, problem.points, given, options.max_error_px, options.seed
     )
@@ -124,9 +125,11 @@ def focal_misfit(
         if isinstance(estimate, PoseEstimate):
             start = estimate.rig_from_world, estimate.inliers
             second = _freed(other, given, *start, options.max_error_px)
-            if second is not None and second.cost < fit.cost:
+            if second is not None and (
+                estimate.num_inliers > pose.num_inliers if fit is None else second.cost < fit.cost
+            ):
                 fit = second
-    if not fit.contradicts:
+    if fit is None or not fit.contradicts:
         return None
     shift = np.linalg.norm(fit.rig_from_world.center() - pose.cam_from_world.center())
     return (

@@ -78,7 +78,7 @@ def test_derivatives_of_a_freed_camera_equal_central_differences() -> None:
     np.testing.assert_allclose(_linearized(rays, points, change)[1], expected, atol=1e-8)
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.05])
+@pytest.mark.parametrize("factor", [0.5, 1.05, 10.0])
 def test_a_wrong_focal_length_is_detected(factor: float) -> None:
     result = misfit(factor)
     assert result is not None
