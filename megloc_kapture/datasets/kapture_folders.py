@@ -34,6 +34,10 @@ Key = TypeVar("Key")
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 _SENSORS = "sensors/sensors.txt"
+_NO_POSE = (
+    "no image has a pose: sensors/trajectories.txt is missing, or has other timestamps or sensors "
+    "than records_camera.txt"
+)
 
 
 def is_kapture(folder: Path) -> bool:
@@ -86,7 +90,20 @@ def checked_folders(
             f"{shared[0]}; give the queries a separate folder with --query-prefix",
             path=root,
         )
+    if is_kapture(root / QUERY_GT):
+        _check_truth(root / QUERY_GT, query_data.image_names())
     return mapping, map_data, query, query_data
+
+
+def _check_truth(folder: Path, queries: Sequence[str]) -> None:
+    true_poses = KaptureFolder(folder).read().poses()
+    require(true_poses, f"{_NO_POSE}; delete the folder if true poses are unknown", path=folder)
+    require(
+        not true_poses.keys().isdisjoint(queries),
+        f"its {len(true_poses)} images with poses, such as {min(true_poses)!r}, are not queries, "
+        f"such as {queries[0]!r}",
+        path=folder,
+    )
 
 
 def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") -> dict[str, float]:
@@ -149,7 +166,7 @@ def _tables_beside(mapping: KaptureFolder) -> Path:
 
 def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
     poses = mapping.read().poses()
-    require(poses, "no mapping image has a pose (sensors/trajectories.txt)", path=mapping.root)
+    require(poses, _NO_POSE, path=mapping.root)
     return poses
 
 

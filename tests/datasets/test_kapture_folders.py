@@ -141,10 +141,25 @@ def test_equal_names_of_map_and_queries_need_a_prefix(root: Path, tmp_path: Path
 def test_a_map_without_poses_or_no_queries_are_refused(root: Path, tmp_path: Path) -> None:
     for part, names, message in (
         ("query", [], r"root/query: there are no query images"),
-        ("mapping", ["a.png"], r"root/mapping: no mapping image has a pose"),
+        ("mapping", ["a.png"], r"root/mapping: no image has a pose"),
     ):
         shutil.rmtree(root / part)
         write_part(root, part, names, poses=False)
+        with pytest.raises(DataError, match=message):
+            import_kapture_folders(root, tmp_path / "out")
+
+
+def test_truth_of_no_query_is_refused(root: Path, tmp_path: Path) -> None:
+    for names, poses, message in (
+        (
+            ["b/q.jpg", "r.jpg"],
+            True,
+            r"query_gt: its 2 .* 'b/q.jpg', are not queries, .* 'b/q.png'",
+        ),
+        (["b/q.png"], False, r"query_gt: no image has a pose: sensors/trajectories.txt is missing"),
+    ):
+        shutil.rmtree(root / "query_gt")
+        write_part(root, "query_gt", names, poses=poses, images=False)
         with pytest.raises(DataError, match=message):
             import_kapture_folders(root, tmp_path / "out")
 

@@ -44,8 +44,8 @@ class Sensor:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
         if self.params[:1] == (UNKNOWN_CAMERA,):
             raise DataError(
-                "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics, or localize the "
-                "image with `megloc localize --query`, which estimates the focal length"
+                "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics, or estimate them: "
+                "`megloc localize --query` does so for queries, `megloc map` for map images"
             )
         require(len(self.params) > 2, "expected a camera model, width, height and parameters")
         model, *texts = self.params
