@@ -132,6 +132,10 @@ def test_unusable_maps_are_refused(workspace: Path, map_copy: Path, tmp_path: Pa
         KaptureMap.open(tmp_path / "nowhere")
     with pytest.raises(DataError, match="not a kapture folder; it has .*mapping.*: give"):
         KaptureMap.open(workspace)
+    (tmp_path / "nerfstudio/colmap/sparse/0").mkdir(parents=True)
+    (tmp_path / "nerfstudio/colmap/sparse/0/points3D.bin").touch()
+    with pytest.raises(DataError, match="there is a COLMAP model in .*/colmap/sparse/0"):
+        KaptureMap.open(tmp_path / "nerfstudio")
     with pytest.raises(DataError, match="points3d.txt: a file; give a kapture folder"):
         KaptureMap.open(map_copy / "reconstruction" / "points3d.txt")
     with pytest.raises(DataError, match="no map to localize in: .*megloc triangulate"):
