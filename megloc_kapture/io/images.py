@@ -64,6 +64,7 @@ def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
 
 def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[np.uint8]:
     """Decode the bytes of an image file; errors name the ``path``."""
+    _check_complete(path, content)
     image = _decoded_by_opencv(content)
     if image is None:
         with reading(path, "an image"):
@@ -71,8 +72,6 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
 
             with Image.open(BytesIO(content)) as opened:
                 image = pillow_pixels(opened)
-    else:
-        _check_complete(path, content)
     return with_8_bits(image)
 
 
@@ -188,7 +187,7 @@ def check_image_file(path: Path) -> None:
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:
-    """Raise DataError for a truncated file, which OpenCV silently fills with grey."""
+    """Raise DataError for a truncated file, which OpenCV fills with grey; libpng prints errors."""
     if content.startswith(b"\xff\xd8"):
         # end-of-image marker after the last start-of-scan: entropy-coded data contains neither, and
         # the markers of a thumbnail come first

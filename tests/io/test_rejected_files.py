@@ -227,15 +227,18 @@ def test_a_depth_map_of_another_size_or_a_missing_one_is_named(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
-def test_truncated_images_are_named(tmp_path: Path, suffix: str) -> None:
+def test_truncated_images_are_named(
+    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / ("a" + suffix)
-    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    pixels = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(path)
     content = path.read_bytes()
     for share in (0.5, 0.99):
         path.write_bytes(content[: int(len(content) * share)])
         with pytest.raises(DataError, match=path.name):
             read_image_rgb(path)
+    assert capfd.readouterr().err == ""
 
 
 def test_files_other_than_images_are_named(tmp_path: Path) -> None:
