@@ -204,6 +204,12 @@ def test_features_matches_and_a_pose_by_arrays(built: megloc.Map, scene: Path) -
     assert not failed and failed.reason
 
 
+def test_a_video_has_a_result_per_frame(built: megloc.Map, tmp_path: Path) -> None:
+    (tmp_path / "broken.MP4").touch()
+    (failure,) = built.localize(tmp_path / "broken.MP4").values()
+    assert "not a video" in failure.reason
+
+
 def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     with pytest.raises(megloc.OptionError, match="prior is for one image"):
         built.localize(scene / "query", prior=["0000.jpg"])

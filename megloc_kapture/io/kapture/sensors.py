@@ -56,8 +56,11 @@ def read_kapture_data(root: Path) -> KaptureData:
             raise DataError(f"not a kapture folder; it has {inner}: give one of them", path=root)
         # nerfstudio has colmap/sparse/0, COLMAP's dense reconstruction dense/0/sparse
         if models := sorted(path.parent for path in root.rglob("points3D.*")):
-            message = f"not a kapture folder; there is a COLMAP model in {models[0]}"
-            raise DataError(message, path=root)
+            raise DataError(
+                f"not a kapture folder; there is a COLMAP model in {models[0]}, of which `megloc "
+                "import colmap` makes a map",
+                path=root,
+            )
         raise DataError(
             "not a kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
             "--images` localizes them, `megloc map` maps them. A COLMAP model? `megloc "
