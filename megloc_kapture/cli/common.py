@@ -219,7 +219,9 @@ class Reading:
         return existing(self.features_dir)
 
     def kapture(self, root: Path) -> KaptureFolder:
-        return KaptureFolder(root, features_dirs=self.features_dirs)
+        folder = KaptureFolder(root, features_dirs=self.features_dirs)
+        folder.read()  # names a COLMAP model or photographs, before features are missed
+        return folder
 
     def kapture_map(self, root: Path) -> KaptureFolder:
         """Open the kapture folder of a map or workspace."""
