@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.datasets.kapture_folders import fitted_camera, warn_of_scaled
 from megloc_kapture.errors import DataError, OptionError, require, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import REPORT_HTML
@@ -26,6 +27,7 @@ from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import (
     VIDEO_SUFFIXES,
     guessed_camera,
+    image_size,
     photo_of,
     pillow_pixels,
     read_image_rgb,
@@ -214,6 +216,15 @@ def _query_of(
 ) -> Query:
     name, orientation = "query", 1
     check_image(image)
+    if camera is not None:
+        check_camera(camera)
+        if isinstance(image, np.ndarray):
+            size = image.shape[1], image.shape[0]
+        else:
+            size = image_size(image) if isinstance(image, Path) else image.size
+        given, camera = camera, fitted_camera(camera, size)
+        place = image if isinstance(image, Path) else Path(name)
+        warn_of_scaled(place, [(given, camera)] if camera != given else [])
     if isinstance(image, Path):
         name = image.name  # as in a list or a folder
         if camera is None:

@@ -16,6 +16,7 @@ from PIL import Image, ImageOps
 import megloc_kapture as megloc
 from megloc_kapture.io.images import read_image_rgb, read_photo
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.preprocessing.frames import scaled_camera
 
 SMALL = {"local_features.options.max_keypoints": 800, "global_features.options.num_clusters": 8}
 
@@ -154,6 +155,11 @@ def test_a_pose_says_what_it_rests_on(built: megloc.Map, scene: Path) -> None:
         assert pose.covariance is not None and pose.covariance.shape == (6, 6)
     assert result.camera is None and result.name == folder.image_path(name).name
     assert reprojection_px(result, camera) <= 12
+    twice = scaled_camera(camera, 2 * camera.width, 2 * camera.height)
+    for image in (folder.image_path(name), read_image_rgb(folder.image_path(name))):
+        # the scaled camera differs by rounding
+        scaled = built.localize(image, twice)
+        np.testing.assert_allclose(scaled.matrix, result.matrix, atol=1e-6)
     assert len(result.inlier_points_px) == len(result.inlier_points_world) == result.num_inliers
     assert {"extraction", "retrieval", "matching", "estimation"} <= result.seconds.keys()
     # in pixels of the image as it was given, whatever was made of it

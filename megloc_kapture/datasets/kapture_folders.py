@@ -225,6 +225,12 @@ def is_scaled(camera: Camera, size: tuple[int, int]) -> bool:
     return difference <= max(width, height, camera.width, camera.height)
 
 
+def fitted_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+    """Scale a camera to an image of another size but the same aspect ratio."""
+    is_other = size != (camera.width, camera.height)
+    return scaled_camera(camera, *size) if is_other and is_scaled(camera, size) else camera
+
+
 def cameras_of_folder(folder: KaptureFolder) -> tuple[dict[str, Camera], list[DataError]]:
     data = folder.read()
     taken = {sensor_id for _, sensor_id in data.records_camera}

@@ -16,8 +16,8 @@ import numpy as np
 
 from megloc_kapture.datasets.kapture_folders import (
     check_image_size,
+    fitted_camera,
     is_kapture,
-    is_scaled,
     warn_of_scaled,
     with_cameras_of_images,
 )
@@ -427,12 +427,11 @@ class Photographs(Queries):
                 self.without_row.append(name)
             self._photos[name], self._paths[name] = read_photo(path), path
             return
-        size = image_size(path)
-        if size != (camera.width, camera.height) and is_scaled(camera, size):
-            self._scaled.append((camera, scaled_camera(camera, *size)))
-            camera = self._scaled[-1][1]
-        check_image_size(path, camera)
-        self._photos[name], self._paths[name] = Photo(camera), path
+        fitted = fitted_camera(camera, image_size(path))
+        if fitted != camera:
+            self._scaled.append((camera, fitted))
+        check_image_size(path, fitted)
+        self._photos[name], self._paths[name] = Photo(fitted), path
 
     def _add_video(
         self, name: str, path: Path, camera: Camera | Mapping[str, Camera] | None, every: int
