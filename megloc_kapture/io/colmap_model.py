@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import load_pycolmap, quiet_stderr
-from megloc_kapture.io.files import TEMPORARY, check_relative, named, read_text, reading
+from megloc_kapture.io.files import (
+    TEMPORARY,
+    check_relative,
+    failed_download,
+    named,
+    read_text,
+    reading,
+)
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.io.text_lines import numbers_of, read_camera_rows, reading_lines
@@ -139,6 +146,8 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     """
     paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
+        if path.name != "points3D.txt" and (failed := failed_download(path)):
+            raise DataError(failed, path=path)
         if path.name in _RECORDS:
             _check_complete(path)
     names: dict[int, str] = {}

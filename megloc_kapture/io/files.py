@@ -68,7 +68,15 @@ def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
 
 def _text_of(error: Exception, path: Path | str | None) -> str:
     """Describe a failed download, or return an error's first sentence without object reprs."""
-    with contextlib.suppress(OSError), open(path or "", "rb") as file:
+    if failed := failed_download(path or ""):
+        return failed
+    text = getattr(error, "strerror", None) or str(error)
+    return " ".join(re.sub(r"<\S+ object at \S+>|[.;]\s.*", "", text, flags=re.S).split())
+
+
+def failed_download(path: Path | str) -> str | None:
+    """Describe an empty file, a Git LFS pointer or a web page in place of a file; else None."""
+    with contextlib.suppress(OSError), open(path, "rb") as file:
         start = file.read(100).lstrip()
         if not start:
             return "the file is empty"
@@ -76,8 +84,7 @@ def _text_of(error: Exception, path: Path | str | None) -> str:
             return "a Git LFS pointer; fetch the file with `git lfs pull`"
         if start.lower().startswith((b"<!doctype", b"<html")):
             return "a web page; download the file itself"
-    text = getattr(error, "strerror", None) or str(error)
-    return " ".join(re.sub(r"<\S+ object at \S+>|[.;]\s.*", "", text, flags=re.S).split())
+    return None
 
 
 @contextlib.contextmanager
