@@ -272,7 +272,7 @@ def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
 
 
 _STAMP = "colmap.txt"
-_VERSION = 3  # version of the import; a change rebuilds all maps
+_VERSION = 4  # version of the import; a change rebuilds all maps
 
 
 def colmap_maps_folder() -> Path:
