@@ -55,7 +55,8 @@ def read_kapture_data(root: Path) -> KaptureData:
         if inner:
             raise DataError(f"not a kapture folder; it has {inner}: give one of them", path=root)
         # nerfstudio has colmap/sparse/0, COLMAP's dense reconstruction dense/0/sparse
-        if models := sorted(path.parent for path in root.rglob("points3D.*")):
+        places = [f"{'*/' * depth}points3D.*" for depth in range(4)]
+        if models := sorted(path.parent for place in places for path in root.glob(place)):
             raise DataError(
                 f"not a kapture folder; there is a COLMAP model in {models[0]}, of which `megloc "
                 "import colmap` makes a map",
