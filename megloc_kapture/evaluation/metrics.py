@@ -66,6 +66,12 @@ def thresholds_from_pairs(pairs: Iterable[tuple[float, float | None]]) -> tuple[
     return tuple(Threshold(position_m=p, angle_deg=a) for p, a in pairs)
 
 
+def from_fine_to_coarse(thresholds: Iterable[Threshold]) -> list[Threshold]:
+    return sorted(
+        thresholds, key=lambda t: (t.position_m, np.inf if t.angle_deg is None else t.angle_deg)
+    )
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseErrors:
     """Errors of the N queries ``names``.

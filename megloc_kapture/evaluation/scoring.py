@@ -23,6 +23,7 @@ from megloc_kapture.evaluation.metrics import (
     RecallRow,
     Threshold,
     confidence_of,
+    from_fine_to_coarse,
     pose_errors,
     recall_row,
     row_members,
@@ -177,7 +178,7 @@ class Evaluation(Reported):
 
     @property
     def confidence(self) -> Confidence | None:
-        return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
+        return confidence_of(self.queries, from_fine_to_coarse(self.thresholds)[-1], self.nowhere)
 
     def rows_above(self, min_confidence: float) -> tuple[RecallRow, ...]:
         """Return recall rows that count poses below a confidence as misses.
@@ -244,13 +245,7 @@ def evaluate_poses(
         counted,
         "no query with a true pose counts in this benchmark: is this the right ground truth?",
     )
-    # from fine to coarse: confidences and colours of queries depend on the order
-    thresholds = tuple(
-        sorted(
-            thresholds or thresholds_from_pairs(benchmark.protocol.thresholds),
-            key=lambda t: (t.position_m, np.inf if t.angle_deg is None else t.angle_deg),
-        )
-    )
+    thresholds = tuple(thresholds or thresholds_from_pairs(benchmark.protocol.thresholds))
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
     queries = tuple(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.metrics import Threshold, from_fine_to_coarse
 from megloc_kapture.evaluation.report.content import format_degrees, format_metres
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
@@ -69,7 +69,7 @@ def _worst_first(query: QueryResult) -> tuple[float, float, float, str]:
 
 def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, str]:
     if thresholds:
-        shown = thresholds[: len(_SCALE) - 1]
+        shown = from_fine_to_coarse(thresholds)[: len(_SCALE) - 1]
         for color, threshold in zip(_SCALE, shown, strict=False):
             if threshold.holds(query.position_m, query.angle_deg):
                 return color, f"within {threshold}"

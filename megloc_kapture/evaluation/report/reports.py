@@ -26,6 +26,7 @@ from megloc_kapture.evaluation.comparison import (
     WithoutTruth,
     inliers_quartiles,
 )
+from megloc_kapture.evaluation.metrics import from_fine_to_coarse
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.report import content
 from megloc_kapture.evaluation.report.queries import shown_queries, worst_queries
@@ -110,7 +111,9 @@ def _facts(reported: Reported) -> list[_Fact]:
         if (confident := content.confident_table(evaluation)) is not None:
             facts.append((f"{content.CONFIDENT}{whose}", confident))
         if (confidence := evaluation.confidence) is not None:
-            sentences = content.confidence_sentences(confidence, thresholds[-1])
+            sentences = content.confidence_sentences(
+                confidence, from_fine_to_coarse(thresholds)[-1]
+            )
             facts.append((f"Confidence{whose}: {'; '.join(sentences)}.", None))
         if (check := evaluation.covariance) is not None:
             errors = content.counted(check["num_poses"], "error lies", "errors lie")
