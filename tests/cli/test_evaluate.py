@@ -142,6 +142,7 @@ def test_a_submission_of_relocalization_pairs_is_a_folder(megloc: Any, tmp_path:
     root, place = tmp_path / "imported", tmp_path / "submission"
     write_relocalization_dataset(root)
     command = ["submit", "4seasons", "-i", root / "localized", "-o", place]
+    place.mkdir()  # an empty folder may exist
     done = megloc(*command)
     assert done.out == f"3 poses of 4 queries, 1 missing, written as dummy poses: {place}\n"
     assert {path.name for path in tmp_path.glob("submission*")} == {place.name, "submission.json"}

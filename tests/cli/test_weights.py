@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 
+from megloc_kapture.cli import weights as weights_command
 from megloc_kapture.io import weights
 
 
@@ -188,3 +189,20 @@ def test_files_are_listed_and_damaged_and_missing_ones_named(megloc: Any, folder
     assert re.search(r"wrong: .*free\.pth: is not the published free\.pth of free", done.out)
     done = megloc("weights", "check", "bound")
     assert done.status == 2 and "run: megloc weights fetch bound --accept-licence" in done.out
+
+
+@pytest.mark.parametrize(
+    ("versions", "problem"),
+    [
+        ({"torch": "2.5.1+cpu", "torchvision": "0.20.1"}, "pip uninstall torchvision"),
+        ({"torch": "2.5.1+cpu", "torchvision": "0.20.1+cpu"}, ""),
+        ({"opencv-python": "4", "opencv-python-headless": "4"}, "both write the folder cv2"),
+        ({"opencv-python": "4"}, ""),
+    ],
+)
+def test_packages_that_conflict_are_found(
+    monkeypatch: pytest.MonkeyPatch, versions: dict[str, str], problem: str
+) -> None:
+    monkeypatch.setattr(weights_command, "installed_version", versions.get)
+    problems = weights_command.find_problems()
+    assert len(problems) == bool(problem) and problem in "".join(problems)
