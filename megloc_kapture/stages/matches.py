@@ -152,8 +152,11 @@ def match_pairs(
     A pair without verified matches is also written, which marks it as finished.
     """
     within_one = first.root == second.root
-    # within a map (a, b) and (b, a) are one pair, stored in one file
-    ordered = sorted({one_way(pair) if within_one else (pair.query, pair.map) for pair in pairs})
+    # within a map (a, b) and (b, a) are one pair, stored in one file, and (a, a) is none
+    if within_one:
+        ordered = sorted({one_way(pair) for pair in pairs if pair.query != pair.map})
+    else:
+        ordered = sorted({(pair.query, pair.map) for pair in pairs})
     writer = MatchesWriter(output, local_type, orphan=True)
     counts: dict[tuple[str, str], PairCount] = {}
     if work.resume:

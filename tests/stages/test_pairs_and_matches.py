@@ -334,7 +334,7 @@ def test_all_matches_or_verified_matches_are_stored(world: Any, tmp_path: Path) 
     assert any(count.verified < count.matches for count in counts)
 
 
-def test_pairs_without_matches_are_stored_and_repeated_pairs_matched_once(
+def test_pairs_without_matches_are_stored_and_images_matched_once_and_not_with_themselves(
     world: Any, write_features: Any, tmp_path: Path
 ) -> None:
     empty, full = ("left/0.png", "left/1.png"), ("left/0.png", "right/2.png")
@@ -345,6 +345,7 @@ def test_pairs_without_matches_are_stored_and_repeated_pairs_matched_once(
     write_features(tmp_path, "descriptors", "toy", descriptors)
     folder = world.mapping().with_features([tmp_path])
     pairs = [ImagePair(*pair, score) for pair in (empty, full) for score in (0.2, 0.9)]
+    pairs += [ImagePair(image, image, 1.0) for image in rows]
     for verification, matched in ((KnownPoseOptions(), 0), (None, 4)):
         out = tmp_path / f"out{matched}"
         counts = match_pairs(folder, folder, pairs, "toy", NearestNeighbours(), verification, out)
