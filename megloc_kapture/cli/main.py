@@ -121,6 +121,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         if arguments is None:
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+            # matplotlib fails to load if a notebook's backend is not in this environment
+            os.environ["MPLBACKEND"] = "agg"
         if list(given) == ["--version"]:
             from megloc_kapture import __version__
 
@@ -128,8 +130,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(DONE)
         import tyro
 
-        if isinstance(sys.stdout, TextIOWrapper):  # results appear at once, even in a pipe
-            sys.stdout.reconfigure(line_buffering=True)
+        if isinstance(sys.stdout, TextIOWrapper):
+            # results appear at once, even in a pipe, with names that the terminal cannot print
+            sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
         command = tyro.cli(
             _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
         )

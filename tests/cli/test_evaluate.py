@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +91,23 @@ def test_two_results_are_compared_query_by_query(megloc: Any, runs: Path, tmp_pa
     poses.write_text(format_pose_file(poses_off(0.01, 2), names="basename"))
     done = megloc(*results(runs, "a"), "-i", poses, "--gt", runs / "a/query_gt")
     assert "/poses.txt localize the same 38 queries" in " ".join(done.out.split())
+
+
+def test_a_notebook_backend_and_a_terminal_without_unicode_do_no_harm(
+    runs: Path, tmp_path: Path
+) -> None:
+    linked = tmp_path / "später"
+    linked.symlink_to(runs / "b/localized")
+    command = [*results(runs, "a"), "-i", linked, "--gt", runs / "a/query_gt", "-o", tmp_path / "o"]
+    environment = {"MPLBACKEND": "module://missing", "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(
+        [sys.executable, "-m", "megloc_kapture", *map(str, command)],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "sp\\xe4ter" in done.stdout
 
 
 def test_results_without_truth_are_compared_with_each_other(
