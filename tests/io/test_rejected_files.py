@@ -132,6 +132,13 @@ def test_the_layout_of_kapture_1_0_names_the_remedy(tmp_path: Path) -> None:
         list_types(tmp_path, "keypoints", orphan=False)
 
 
+def test_the_folder_of_a_type_names_the_folder_to_give(tmp_path: Path) -> None:
+    (tmp_path / "global_features").mkdir()
+    (tmp_path / "global_features/global_features.txt").write_text(VERSION)
+    with pytest.raises(DataError, match="that contains global_features/TYPE/global_features"):
+        list_types(tmp_path, "global_features", orphan=True)
+
+
 @pytest.mark.parametrize("content", [b"", b"image\na\n", b"image,reason,extra\na,b,c\n"])
 def test_a_csv_table_with_another_header_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "table.csv"

@@ -95,8 +95,10 @@ def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
     if not parent.is_dir():
         return []
     if (parent / f"{kind}.txt").is_file():
-        message = "features of kapture 1.0 without a type: upgrade with kapture_upgrade_1_0_to_1_1"
-        raise DataError(message, path=parent)
+        message = "upgrade features of kapture 1.0 with kapture_upgrade_1_0_to_1_1"
+        if orphan:
+            message = f"give the folder that contains {parent.name}/TYPE/{kind}"
+        raise DataError(f"features without the folder of their type: {message}", path=parent)
     types = []
     with reading(parent):
         names = sorted(entry.name for entry in parent.iterdir() if not entry.name.startswith("."))
