@@ -6,6 +6,7 @@ Heavy modules are imported within :func:`main`, so that Ctrl-C is handled during
 from __future__ import annotations
 
 import ast
+import errno
 import functools
 import operator
 import os
@@ -166,6 +167,8 @@ def _tell(error: BaseException, debug: bool) -> int:
         lines = [hint]
     elif isinstance(error, OSError) and error.filename is not None:
         lines = [f"{error.filename}: {error.strerror}"]  # unreadable file, or name too long
+    elif isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        lines = [f"{error.strerror}: free some in the output's or the temporary folder (TMPDIR)"]
     else:
         raise error
     if debug:

@@ -91,6 +91,14 @@ def test_sigterm_ends_with_143_and_says_how_to_continue(
     assert capsys.readouterr().err == message
 
 
+def test_a_full_disk_is_no_internal_error() -> None:
+    command = [sys.executable, "-m", "megloc_kapture", "options"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("megloc: No space left on device: free some ")
+
+
 def test_the_completion_of_bash_has_all_commands_and_their_flags(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
