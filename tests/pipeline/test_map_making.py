@@ -88,6 +88,12 @@ def test_a_changed_model_is_imported_again(workspace: Path) -> None:
     assert [path.name for path in colmap_maps_folder().iterdir()] == [first.name]
 
 
+def test_a_cache_that_cannot_be_written_names_the_setting(workspace: Path) -> None:
+    colmap_maps_folder().parents[1].touch()
+    with pytest.raises(megloc.OutputError, match="maps: cannot write: .*; XDG_CACHE_HOME sets"):
+        kapture_of(workspace)
+
+
 def test_a_damaged_model_leaves_no_map(
     workspace: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
