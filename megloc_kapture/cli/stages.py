@@ -33,6 +33,7 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
+from megloc_kapture.io.output_folders import check_new_file
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
@@ -74,7 +75,8 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
     elif types:
         reason = f"several types of {kind}, choose one: {present}"
     else:
-        reason = f"no {kind}; give their folder with --features-dir"
+        layout = "global_features" if kind == "global_features" else "local_features"
+        reason = f"no {kind}; --features-dir FOLDER adds those in FOLDER/{layout}/TYPE/{kind}"
     raise OptionError(f"{folder.root}: {reason}")
 
 
@@ -248,7 +250,7 @@ class PairsMapping(Reading, Choosing, Working):
     """Overwrite the pairs file."""
 
     def run(self) -> None:
-        _refuse_existing(self.output, force=self.force)
+        check_new_file(self.output, force=self.force)
         mapping = self.kapture_map(self.input)
         chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
@@ -304,7 +306,7 @@ class PairsQuery(Reading, Choosing, Working):
     def run(self) -> None:
         if (self.rerank is None) != (self.matches_dir is None):
             raise OptionError("--rerank N needs --matches-dir DIR for its matches, and vice versa")
-        _refuse_existing(self.output, force=self.force)
+        check_new_file(self.output, force=self.force)
         mapping = self.kapture_map(self.input)
         query = self.kapture(self.query)
         mapping.check_features_apart(query)
@@ -364,10 +366,6 @@ def _retrieval(
     if fusion is not None:
         how = how.model_copy(update={"method": fusion})
     return Retrieval(types, fusion=how)
-
-
-def _refuse_existing(path: Path, *, force: bool) -> None:
-    check_option(not path.exists() or force, f"{path} exists; -f overwrites it")
 
 
 @dataclass(frozen=True, kw_only=True)

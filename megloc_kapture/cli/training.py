@@ -22,7 +22,7 @@ from megloc_kapture.cli.common import (
     camera_of_text,
     kapture_map,
 )
-from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, require
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.sensors import unit_quaternion
@@ -220,6 +220,7 @@ class Render(Working):
 
         from megloc_kapture.io.files import write_bytes
         from megloc_kapture.io.images import write_image
+        from megloc_kapture.io.output_folders import check_new_file
         from megloc_kapture.stages.neural_field import open_field
 
         if self.pose is None or self.camera is None:
@@ -232,8 +233,7 @@ class Render(Working):
             check_option(
                 path.suffix.lower() in known, f"{path}: the file must end in {' or '.join(known)}"
             )
-            if path.exists() and not self.force:
-                raise OutputError(f"{path}: exists; -f overwrites it")
+            check_new_file(path, force=self.force)
         with single_threaded():
             field = open_field(self.field)
             light = None if self.appearance is None else field.appearance_of(self.appearance)

@@ -55,6 +55,14 @@ def check_claim(folder: Path, *, kind: str, force: bool = False) -> None:
             )
 
 
+def check_new_file(path: Path, *, force: bool) -> None:
+    """Raise OutputError for a folder, or unless forced for an existing file."""
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; give the name of a file")
+    if path.exists() and not force:
+        raise OutputError(f"{path}: exists; -f overwrites it")
+
+
 def release_folder(folder: Path) -> None:
     """Remove the mark of a folder that got no results, and the folder if it is empty."""
     with contextlib.suppress(OSError):

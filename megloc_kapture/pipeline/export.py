@@ -28,7 +28,6 @@ from megloc_kapture.datasets.kapture_folders import cameras_of_folder, warn_of_s
 from megloc_kapture.errors import (
     DataError,
     OptionError,
-    OutputError,
     check_option,
     require,
     suggestion,
@@ -40,7 +39,7 @@ from megloc_kapture.io.files import similar_name, write_bytes
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.points import write_ply
-from megloc_kapture.io.output_folders import staged_output
+from megloc_kapture.io.output_folders import check_new_file, staged_output
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.map_making import kapture_of
 from megloc_kapture.preprocessing.frames import scaled_camera
@@ -270,8 +269,7 @@ def export(
             else:
                 export_nerfstudio(images, points, out, final=output)
         return len(images)
-    if output.exists() and not force:
-        raise OutputError(f"{output}: exists; --force overwrites it")
+    check_new_file(output, force=force)
     if name == "tum":
         export_tum(images, output)
     else:
@@ -308,7 +306,10 @@ def _read(
         if opened is not None:
             images += _posed_images(opened.folder, opened, sensor, is_query=False)
     if query is not None:
-        images += _posed_images(KaptureFolder(query), opened, sensor, is_query=True)
+        queries = _posed_images(KaptureFolder(query), opened, sensor, is_query=True)
+        if not queries:
+            _log.warning("%s: no query with a pose; give the output of `megloc localize`", query)
+        images += queries
     points = np.zeros((0, 6)) if opened is None else opened.folder.points3d()
     return images, points
 

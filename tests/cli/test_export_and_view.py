@@ -75,6 +75,23 @@ def test_tum_rows_and_ply_vertices_are_those_of_the_poses_and_points(
     assert f"element edge {8 * images}\n" in header
 
 
+def test_queries_without_poses_are_not_exported_silently(
+    megloc: Any, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    done = megloc(
+        "export",
+        "ply",
+        "-i",
+        finished / "map",
+        "--query",
+        finished / "query",
+        "-o",
+        tmp_path / "a.ply",
+    )
+    assert "/query: no query with a pose; give the output of `megloc localize`" in caplog.text
+    assert done.status == 0 and (tmp_path / "a.ply").is_file()
+
+
 def test_nerfstudio_has_opengl_axes_and_paths_of_the_images(
     megloc: Any, finished: Path, tmp_path: Path
 ) -> None:

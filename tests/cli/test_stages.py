@@ -121,7 +121,7 @@ def test_reranked_pairs_and_their_matches_are_written(
     assert counts == {(pair.query, pair.map) for pair in read_pairs(made.query_pairs)}
     assert len(read_pairs(pairs)) == 2 * 4
     megloc(*command, "-f").refused("--rerank N needs --matches-dir DIR")
-    megloc(*command, "--matches-dir", matches).refused(r"reranked\.txt exists; -f")
+    megloc(*command, "--matches-dir", matches).refused(r"reranked\.txt: exists; -f")
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_reranked_pairs_and_their_matches_are_written(
     [
         (("covisibility",), "mapping: no map to pair images by co-visibility"),
         (("sequence", "--covisibility-map", "{}/map"), "--covisibility-map is for --by covis"),
-        (("retrieval",), "mapping: no global_features; give their folder with --features-dir"),
+        (("retrieval",), "no global_features; --features-dir FOLDER adds those in FOLDER/gl"),
     ],
 )
 def test_pairs_without_their_inputs_are_refused(

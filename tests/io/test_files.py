@@ -21,7 +21,13 @@ from megloc_kapture.io.files import (
     write_bytes,
 )
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter
-from megloc_kapture.io.output_folders import MARKER, claim_folder, files_below, staged_output
+from megloc_kapture.io.output_folders import (
+    MARKER,
+    check_new_file,
+    claim_folder,
+    files_below,
+    staged_output,
+)
 
 
 def test_a_file_is_written_with_its_folders_and_the_umask(tmp_path: Path) -> None:
@@ -144,6 +150,17 @@ def foreign(tmp_path: Path) -> Path:
     place.mkdir()
     (place / "thesis.txt").write_text("mine")
     return place
+
+
+def test_an_existing_file_needs_force_and_a_folder_is_no_file(tmp_path: Path) -> None:
+    check_new_file(tmp_path / "new" / "file", force=False)
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="file: exists; -f overwrites it"):
+        check_new_file(tmp_path / "file", force=False)
+    check_new_file(tmp_path / "file", force=True)
+    for force in (False, True):
+        with pytest.raises(OutputError, match="is a folder; give the name of a file"):
+            check_new_file(tmp_path, force=force)
 
 
 def test_a_new_or_empty_folder_is_claimed(tmp_path: Path) -> None:
