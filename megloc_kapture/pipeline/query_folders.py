@@ -51,7 +51,7 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_
 from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
-from megloc_kapture.stages.local_features import check_lengths, mask_path
+from megloc_kapture.stages.local_features import check_lengths, mask_path, warn_of_other_size
 from megloc_kapture.stages.scene import depth_of
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform, check_camera
 
@@ -59,7 +59,7 @@ _log = logging.getLogger(__name__)
 
 FRAMES_EVERY = 30
 # number of queries whose keypoints are compared with the image size, and of keypoints each needs
-_QUERIES_COMPARED, _MIN_COMPARED = 10, 100
+_QUERIES_COMPARED = 10
 _LIST_SUFFIXES = (".txt", ".csv")
 
 
@@ -220,20 +220,11 @@ class KaptureQueries(Queries):
             )
 
     def _warn_of_other_size(self, local: MapKeypoints) -> None:
-        """Warn if keypoints span a size other than that of the images; only a few are read."""
-        reach = []
+        spans = []
         for name in [name for name in self.names if name in local][:_QUERIES_COMPARED]:
             with suppress(DataError):  # a broken file fails only its own query
-                pixels = local.keypoints_px(name)[:, :2]
-                size = np.array(self._sensor(name).params[1:3], np.float64)
-                if len(pixels) >= _MIN_COMPARED and size.all():
-                    reach.append(float((pixels / size).max()))
-        if reach and not 0.7 < max(reach) < 1.1:
-            message = (
-                "%s: keypoints of type %r extend to %.0f %% of the size of the query images; scale "
-                "them if they were extracted at another image size, or the poses will be wrong"
-            )
-            _log.warning(message, self._folder.root, local.name, 100 * max(reach))
+                spans.append((local.keypoints_px(name), self._sensor(name).params[1:3]))
+        warn_of_other_size(spans, local.name, self._folder.root)
 
     def types_of_all(self) -> list[str]:
         return [

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from operator import itemgetter
@@ -35,6 +36,9 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, Batched, Work, in_batches, resumed_label
 from megloc_kapture.values import Camera, LocalFeatures
 
+_log = logging.getLogger(__name__)
+
+_MIN_COMPARED = 100
 Job = tuple[str, KaptureFolder]  # an image and its folder
 
 
@@ -157,6 +161,25 @@ def check_size(size: tuple[int, ...], camera: Camera, name: Path | str) -> None:
             f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
             path=name,
         )
+
+
+def warn_of_other_size(
+    spans: Iterable[tuple[NDArray[np.floating[Any]], Sequence[float | str]]],
+    local_type: str,
+    root: Path,
+) -> None:
+    """Warn if the keypoints (N, 2 or more) of images span another size than width and height."""
+    reach = [
+        float((keypoints_px[:, :2] / np.array(size, np.float64)).max())
+        for keypoints_px, size in spans
+        if len(keypoints_px) >= _MIN_COMPARED and np.array(size, np.float64).all()
+    ]
+    if reach and not 0.7 < max(reach) < 1.1:
+        message = (
+            "%s: keypoints of type %r extend to %.0f %% of the size of the images; scale them if "
+            "they were extracted at another image size, or the poses will be wrong"
+        )
+        _log.warning(message, root, local_type, 100 * max(reach))
 
 
 def read_mask(

@@ -23,6 +23,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.stages.local_features import warn_of_other_size
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import depth_of, depth_records
 from megloc_kapture.stages.stage import (
@@ -75,6 +76,8 @@ def triangulate_map(
             MapImage(image, data.camera_of(image), poses[image], read(image)[:, :2])
             for image in images
         ]
+        spans = [(view.keypoints_px, (view.camera.width, view.camera.height)) for view in views]
+        warn_of_other_size(spans, name, mapping.root)
         verified = matches_of(mapping.matches(name), images, matched)
         type_xyz, type_errors_px, seen = triangulate(
             views, verified, options, num_threads=num_threads, scratch=output.absolute()

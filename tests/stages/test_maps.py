@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,24 @@ def test_missing_poses_matches_and_depth_are_refused(
     with pytest.raises(DataError, match="no matches of type 'r2d2'"):
         triangulate_map(matches, ["rootsift", "r2d2"], tmp_path / "map", options)
     assert not (tmp_path / "map").exists()
+
+
+def test_keypoints_of_larger_images_are_reported(
+    world: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    matches = world.with_matches("mapping")
+    data = matches.read()
+    halved = {
+        key: replace(sensor, params=(model, *(f"{float(number) / 2:g}" for number in numbers)))
+        for key, sensor in data.sensors.items()
+        for model, *numbers in [sensor.params]
+        if sensor.sensor_type == "camera"
+    }
+    write_sensors(tmp_path / "small", replace(data, sensors=halved, records_depth={}))
+    small = KaptureFolder(tmp_path / "small", features_dirs=matches.features_dirs)
+    with suppress(DataError):  # there may be no points
+        triangulate_map(small, ["rootsift"], tmp_path / "map", TriangulationOptions())
+    assert "keypoints of type 'rootsift' extend to 19" in caplog.text
 
 
 def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_path: Path) -> None:
