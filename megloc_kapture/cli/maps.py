@@ -14,6 +14,7 @@ from megloc_kapture.cli.common import (
     Force,
     Input,
     Output,
+    Overwrite,
     Reading,
     Texts,
     Working,
@@ -26,6 +27,7 @@ from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
 from megloc_kapture.io.files import reading
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import check_new_file
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.pipeline.map_making import (
     describe_map,
@@ -138,9 +140,12 @@ class Densify(Reading, Choosing, Working):
     """Also create 3D points, with uncertainty, from the depth of keypoints without a point."""
     fuse: Path | None = None
     """Write the fused point cloud to this PLY file."""
-    force: Force = False
+    force: Overwrite = False
+    """Write into a non-empty folder, and overwrite the PLY file."""
 
     def run(self) -> None:
+        if self.fuse is not None:
+            check_new_file(self.fuse, force=self.force)
         chosen: dict[str, object] = {"mode": "points" if self.points else "depth"}
         if self.by is not None:
             chosen["estimator"] = {"name": self.by}

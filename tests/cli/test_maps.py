@@ -120,6 +120,15 @@ def test_a_refined_foreign_map_loses_uncertain_points_and_is_localized_in(
     assert done.out.startswith("4 of 4 queries localized in ")
 
 
+def test_the_file_of_a_point_cloud_is_checked_before_the_work(
+    megloc: Any, finished: Path, tmp_path: Path
+) -> None:
+    command = ("densify", "-i", finished / "map", "-o", tmp_path / "dense", "--fuse")
+    megloc(*command, tmp_path, "-f").refused("is a folder; give the name of a file")
+    (tmp_path / "cloud.ply").touch()
+    megloc(*command, tmp_path / "cloud.ply").refused("cloud.ply: exists; -f overwrites it")
+
+
 def test_poses_without_depth_are_kept_with_the_reason(
     megloc: Any, finished: Path, tmp_path: Path
 ) -> None:
