@@ -5,6 +5,7 @@ Built-in commands write plain kapture data; a plugin stage runs in a workspace.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, make_dataclass
 from inspect import getdoc
@@ -54,6 +55,8 @@ from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
 from megloc_kapture.stages.reranking import RerankingOptions, reranked
 from megloc_kapture.stages.stage import counts_text
+
+_log = logging.getLogger(__name__)
 
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
 
@@ -139,6 +142,8 @@ class Match(Reading, Choosing, Working):
             first, verification = self.kapture(self.query), options.verify_queries()
             mapping.check_features_apart(first)
         pairs = _read_pairs_of(self.pairs, first, mapping)
+        if isinstance(verification, KnownPoseOptions):
+            self._check_poses(mapping, pairs)
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             if self.query is None and isinstance(verification, KnownPoseOptions):
                 check_given_poses(mapping, pairs, local_type, matcher, work)
@@ -146,6 +151,18 @@ class Match(Reading, Choosing, Working):
                 first, mapping, pairs, local_type, matcher, verification, out, work=work
             )
         self.say(f"{counts['matches']} matches in {counts['pairs_with_matches']} pairs")
+
+    def _check_poses(self, mapping: KaptureFolder, pairs: Sequence[ImagePair]) -> None:
+        posed = mapping.read().poses().keys()
+        unposed = sum(not {pair.query, pair.map} <= posed for pair in pairs)
+        message = (
+            f"{unposed} of {len(pairs)} pairs in {self.pairs} have an image without a pose to "
+            f"verify their matches; --query FOLDER (perhaps also {self.input}) verifies them by "
+            "two-view geometry"
+        )
+        require(not pairs or unposed < len(pairs), message, path=mapping.root)
+        if unposed:
+            _log.warning("%s: %s", mapping.root, message)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -167,6 +167,19 @@ def test_pairs_of_unknown_images_are_refused(megloc: Any, finished: Path, tmp_pa
     assert not (tmp_path / "new").exists()
 
 
+def test_pairs_of_images_without_poses_need_a_two_view_verification(
+    megloc: Any, made: Made, scene: Path, tmp_path: Path
+) -> None:
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("0001.jpg, 0004.jpg, 1.0\n")
+    command = ("match", "-i", scene / "query", "--features-dir", made.features, *INLINE)
+    command += ("--pairs", pairs, "-o", tmp_path / "matches")
+    megloc(*command).refused(
+        "1 of 1 pairs in .*pairs.txt have an image without a pose .* --query FOLDER"
+    )
+    assert "in 1 pairs" in megloc(*command, "--query", scene / "query").err
+
+
 def test_device_and_precision_of_networks_are_chosen_by_flags(
     megloc: Any, shared_data: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
