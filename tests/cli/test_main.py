@@ -91,6 +91,13 @@ def test_sigterm_ends_with_143_and_says_how_to_continue(
     assert capsys.readouterr().err == message
 
 
+def test_a_kapture_folder_without_the_name_of_its_dataset_is_no_aachen(
+    megloc: Any, scene: Path, tmp_path: Path
+) -> None:
+    command = ("eval", "--root", scene, "--workspace", tmp_path / "run", "-q")
+    megloc(*command).refused("in its name; `megloc eval kapture` is for other datasets")
+
+
 def test_a_full_disk_is_no_internal_error() -> None:
     command = [sys.executable, "-m", "megloc_kapture", "options"]
     with open("/dev/full", "w") as full:

@@ -216,7 +216,8 @@ def from_kapture(
     for image in kapture_images:
         require(
             not image.is_query or image.name in images.conditions,
-            f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name",
+            f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name; `megloc eval "
+            "kapture` is for other datasets than Aachen",
             path=form.root,
         )
     return images, {image.name: image.file for image in kapture_images}
