@@ -50,8 +50,8 @@ def check_claim(folder: Path, *, kind: str, force: bool = False) -> None:
         ours = force or not folder.exists() or _read_mark(folder)[:1] == [kind]
         if not ours and any(folder.iterdir()):
             raise OutputError(
-                f"{folder}: is not empty and not a {kind} of megloc; give an empty folder, "
-                "or -f to write into it anyway"
+                f"{folder}: is not empty and no earlier output of this kind ({kind}); give an "
+                "empty folder, or -f to write into it anyway"
             )
 
 

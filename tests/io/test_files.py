@@ -175,12 +175,16 @@ def test_a_new_or_empty_folder_is_claimed(tmp_path: Path) -> None:
 
 def test_a_folder_of_other_files_is_refused_unless_forced(foreign: Path) -> None:
     before = tree(foreign)
-    with pytest.raises(OutputError, match=r"home: is not empty and not a map of megloc; .* -f"):
+    with pytest.raises(
+        OutputError, match=r"not empty and no earlier output of this kind .map.; .* -f"
+    ):
         claim_folder(foreign, kind="map")
     assert tree(foreign) == before
     claim_folder(foreign, kind="map", force=True)
     assert tree(foreign) == {**before, MARKER: b"map\n"}
-    with pytest.raises(OutputError, match="not a feature of megloc"):  # of another kind
+    with pytest.raises(
+        OutputError, match="no earlier output of this kind .feature"
+    ):  # of another kind
         claim_folder(foreign, kind="feature")
     assert tree(foreign) == {**before, MARKER: b"map\n"}
 
