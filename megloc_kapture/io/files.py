@@ -171,7 +171,7 @@ def remove(path: Path) -> None:
 def output_error(path: Path | str, error: OSError) -> OutputError:
     """Return the :class:`OutputError` for an ``OSError`` from writing ``path``."""
     reason = error.strerror or str(error) or type(error).__name__
-    return OutputError(f"{path}: cannot write: {reason}")
+    return OutputError(f"{path}: cannot write: {reason}{_broken_link(Path(path))}")
 
 
 @contextlib.contextmanager
@@ -233,11 +233,18 @@ def link_as_text(path: Path) -> str:
     return f"; {file} is a file, perhaps a link that git or zip stored as text: make it a folder"
 
 
+def _broken_link(path: Path) -> str:
+    with contextlib.suppress(OSError):
+        for link in (path, *path.parents):
+            if link.is_symlink() and not link.exists():
+                return f"; {link} is a link to {os.readlink(link)}, which is missing"
+    return ""
+
+
 def similar_name(path: Path) -> str:
     """Return a remark on a missing file: a broken link, or a file with almost this name; or ""."""
-    for link in (path, *path.parents):
-        if link.is_symlink() and not link.exists():
-            return f"; {link} is a link to {os.readlink(link)}, which is missing"
+    if broken := _broken_link(path):
+        return broken
 
     def plain(name: str) -> str:
         return unicodedata.normalize("NFC", name).casefold()

@@ -173,6 +173,13 @@ def test_a_new_or_empty_folder_is_claimed(tmp_path: Path) -> None:
         claim_folder(place, kind="map")
 
 
+def test_a_link_to_a_missing_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    for folder in (tmp_path / "link", tmp_path / "link" / "new"):
+        with pytest.raises(OutputError, match="cannot write: .*; .*/link is a link to .*/disk, "):
+            claim_folder(folder, kind="map")
+
+
 def test_a_folder_of_other_files_is_refused_unless_forced(foreign: Path) -> None:
     before = tree(foreign)
     with pytest.raises(
