@@ -143,6 +143,12 @@ def test_safetensors_are_recognised_by_content(tmp_path: Path) -> None:
     assert list(read_weights(find_weights(str(tmp_path / "net.pth")))) == ["a"]
 
 
+def test_a_folder_of_weights_that_cannot_be_written_names_the_setting(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="x.pt: cannot write: .*; MEGLOC_WEIGHTS sets another"):
+        fetch("http://localhost/x.pt", tmp_path / "file" / "x.pt")
+
+
 def test_a_broken_download_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with pytest.raises(MeglocError, match="the transfer failed.*run: megloc weights add FILE"):
