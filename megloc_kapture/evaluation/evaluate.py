@@ -7,11 +7,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.evaluation.comparison import WithoutTruth, evaluate_without_truth
 from megloc_kapture.evaluation.metrics import Threshold, pose_errors
 from megloc_kapture.evaluation.pose_files import poses_by_image
@@ -68,7 +68,7 @@ def evaluate(
     *,
     dataset: str | None = None,
     side_tables: Path | str | None = None,
-    thresholds: Sequence[Threshold | tuple[float, float]] | None = None,
+    thresholds: Sequence[Threshold | tuple[float, float] | str] | None = None,
     mapping: Path | str | None = None,
     label: str | None = None,
     align: Align = "none",
@@ -95,12 +95,13 @@ def evaluate(
     label : name of the result in tables; by default its path.
     align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
     """
+    check_option(align in get_args(Align), f"align is {align!r}; give none, se3 or sim3")
+    for folder in (side_tables, mapping):
+        require(folder is None or Path(folder).is_dir(), "no such folder", path=folder)
     benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
-    bounds = [
-        each if isinstance(each, Threshold) else Threshold.parse(", ".join(map(str, each)))
-        for each in thresholds or ()
-    ]
+    given = () if thresholds is None else thresholds
+    bounds = [_threshold(each) for each in ([given] if isinstance(given, str) else given)]
     return evaluate_results(
         [estimated],
         truth,
@@ -110,6 +111,13 @@ def evaluate(
         labels=labels,
         align=align,
     )[0]
+
+
+def _threshold(given: Any) -> Threshold:
+    if isinstance(given, Threshold):
+        return given
+    check_option(np.iterable(given), f"thresholds are a list of (metres, degrees), got {given}")
+    return Threshold.parse(given if isinstance(given, str) else ", ".join(map(str, given)))
 
 
 def benchmark_beside(

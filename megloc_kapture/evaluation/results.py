@@ -6,7 +6,7 @@ import os.path
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,7 +233,10 @@ def result_in_memory(
     poses: dict[str, RigidTransform] = {}
     statuses: dict[str, LocalizationResult] = {}
     covariances = {}
-    for image, pose in estimated.items():
+    by_name: dict[str, Any] = {str(image): pose for image, pose in estimated.items()}
+    for image, pose in by_name.items():
+        if pose is None:  # the cam_from_world of a Failure
+            continue
         if isinstance(pose, RigidTransform):
             poses[image] = pose_files.checked_pose(pose.quat_wxyz, pose.translation, repr(image))
             continue
@@ -246,7 +249,7 @@ def result_in_memory(
             poses[image] = pose.cam_from_world
             if pose.covariance is not None:
                 covariances[image] = pose.covariance
-    images = tuple(sorted(estimated))
+    images = tuple(sorted(by_name))
     return Result(label, poses, images, statuses, covariances=covariances)
 
 

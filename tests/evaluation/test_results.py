@@ -13,7 +13,7 @@ from poses import random_pose
 from scipy.spatial.transform import Rotation
 from scored import write_kapture
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, MeglocError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import format_pose_file
@@ -208,6 +208,27 @@ def test_localization_results_have_reasons_and_inliers(world: Any) -> None:
     assert table.loc[second, "reason"] == "no matches" and table.loc[second, "num_matches"] == 7
     assert table.loc[third, "outcome"] == "missing" and table.loc[third, "num_inliers"] is pd.NA
     assert actual.label == "mine"
+
+
+def test_arguments_from_python(world: Any, tmp_path: Path) -> None:
+    """Rows of an array and texts are thresholds, and a pose may be None, as that of a Failure."""
+    first, *_ = names = sorted(world.truth)
+    for given in ("0.1,1", ["0.1,1"], np.array([[0.1, 1.0]])):
+        actual = evaluate(world.truth, world.truth, thresholds=given)  # type: ignore[arg-type]
+        assert actual.thresholds == (Threshold(position_m=0.1, angle_deg=1.0),)
+    poses: dict[Any, Any] = {Path(name): world.truth[name] for name in names}
+    row = evaluate({**poses, Path(first): None}, world.truth).row()
+    assert (row.num_queries, row.num_localized) == (len(names), len(names) - 1)
+    wrong: Any
+    for wrong, message in (
+        ({"thresholds": (0.1, 1)}, r"a list of \(metres, degrees\), got 0\.1"),
+        ({"align": "sim"}, "align is 'sim'; give none, se3 or sim3"),
+        ({"align": None}, "align is None; give"),
+        ({"side_tables": tmp_path / "no"}, "no: no such folder"),
+        ({"mapping": tmp_path / "no"}, "no: no such folder"),
+    ):
+        with pytest.raises(MeglocError, match=message):
+            evaluate(world.truth, world.truth, **wrong)
 
 
 def test_labels_do_not_decide_the_type_of_a_column(world: Any) -> None:
