@@ -102,6 +102,9 @@ def test_it_has_a_command_of_its_own(
     assert "count-keypoints" in megloc("--help")[1]
     text = megloc("count-keypoints", "--help")[1]
     assert "Count the keypoints of every map image." in text
+    sys.modules["keypoint_counts"].CountKeypoints.__doc__ = None  # not that of Stage
+    assert "Run the stage count_keypoints." in megloc("count-keypoints", "--help")[1]
+    assert "least = 0\n" in megloc("options", "count_keypoints")[1]
     command = ("count-keypoints", "-w", str(workspace.root), "--executor", "inline")
     assert megloc(*command) == (2, f"megloc: {workspace.root} is not a workspace of megloc eval\n")
     run_plan(planned(scene, {}), workspace, last="import")
@@ -133,6 +136,16 @@ def test_a_stage_that_cannot_be_loaded_leaves_the_other_commands_alone(
         main(["count-keypoints", "-w", "workspace"])
     assert end.value.code == 2
     assert "cannot be loaded: broken" in capsys.readouterr().err
+
+
+def test_a_stage_may_be_registered_with_a_hyphen(
+    installed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entries = next(installed.glob("*.dist-info")) / "entry_points.txt"
+    entries.write_text(entries.read_text().replace("count_keypoints =", "count-keypoints ="))
+    with pytest.raises(SystemExit) as end:
+        main(["count-keypoints", "--help"])
+    assert end.value.code == 0 and "Count the keypoints" in capsys.readouterr().out
 
 
 def test_what_cannot_be_planned_is_refused(scene: Path) -> None:

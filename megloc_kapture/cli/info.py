@@ -39,11 +39,13 @@ from megloc_kapture.plugins import (
     DATASETS,
     DEPTH_ESTIMATORS,
     GLOBAL_FEATURES,
+    IMAGE_DISTANCES,
     LOCAL_FEATURES,
     MATCHERS,
     POSE_RANKERS,
     POSE_REFINERS,
     SEGMENTERS,
+    STAGES,
     PluginChoice,
 )
 from megloc_kapture.stages.global_features import VLAD
@@ -226,6 +228,9 @@ class OptionsCommand(Common):
             selected = [option for option in selected if option[0] in BASIC_OPTIONS]
         if not selected:
             selected = list(_options_of_plugins(self.key))
+            if not selected and self.key in _plugins():
+                print(f"{self.key} has no options")
+                return
         if not selected:
             keys = [key for key, _, _ in every]
             steps = {key.rpartition(".")[0] for key in keys} - {""}
@@ -274,11 +279,11 @@ def _is_below(key: str, asked: str) -> bool:
 
 
 def _plugins() -> dict[str, list[str]]:
-    """Return plugin name -> groups in which it is registered, for groups with options."""
+    """Return plugin name -> groups in which it is registered."""
     groups_of: dict[str, list[str]] = {VLAD: []}
     for group in (
         *(LOCAL_FEATURES, GLOBAL_FEATURES, MATCHERS, POSE_RANKERS, POSE_REFINERS),
-        *(SEGMENTERS, DEPTH_ESTIMATORS, DATASETS),
+        *(SEGMENTERS, DEPTH_ESTIMATORS, IMAGE_DISTANCES, DATASETS, STAGES),
     ):
         for name in plugin_names(group):
             groups_of.setdefault(name, []).append(group)

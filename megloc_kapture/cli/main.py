@@ -77,8 +77,9 @@ def command_class(name: str) -> type[Any]:
         command: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
         return command
     from megloc_kapture.cli.stages import stage_command
+    from megloc_kapture.plugin_names import STAGES, plugin_names
 
-    return stage_command(name.replace("-", "_"))
+    return stage_command(next(n for n in plugin_names(STAGES) if n.replace("_", "-") == name))
 
 
 def _parser(given: Sequence[str]) -> Any:

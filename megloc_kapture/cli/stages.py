@@ -8,12 +8,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, make_dataclass
-from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
-from pydantic import ValidationError
 
 from megloc_kapture.cli.common import (
     AllowedLinks,
@@ -37,8 +35,13 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, writ
 from megloc_kapture.io.output_folders import check_new_file
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import Workspace, run_plan
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.plugin_loading import load_chosen, load_plugin, option_fault, plugin_class
+from megloc_kapture.pipeline.presets import (
+    DEFAULT_PRESET,
+    assigned,
+    options_of_preset,
+    options_with,
+)
+from megloc_kapture.plugin_loading import load_chosen, load_plugin, plugin_class
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.retrieval.search import FusionMethod
 from megloc_kapture.stages.global_features import extract_global_features, extract_vlad, vlad_type
@@ -409,7 +412,7 @@ def stage_command(name: str) -> type[Any]:
     """Return the command of a registered stage."""
     command = make_dataclass(name, [], bases=(OutsideStage,), frozen=True, kw_only=True)
     command.stage = name  # type: ignore[attr-defined]
-    command.__doc__ = getdoc(plugin_class(STAGES, name)) or f"Run the stage {name}."
+    command.__doc__ = plugin_class(STAGES, name).__doc__ or f"Run the stage {name}."
     return command
 
 
@@ -467,16 +470,10 @@ class Preprocess(Computing, Working):
             "unchanging": self.unchanging,
             "user_masks": self.user_masks,
         }
-        tree: dict[str, Any] = {
-            "max_size_px": self.resize,
-            "undistort": self.undistort,
-            **assigned(self.set),
-        }
-        changes = tree.pop("masks", {})
-        try:
-            return PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
-        except ValidationError as error:
-            raise OptionError(f"option {option_fault(error, PreprocessingOptions)}") from error
+        flags = {"max_size_px": self.resize, "undistort": self.undistort, "masks": masks}
+        given = assigned(self.set)
+        given |= given.pop("preprocessing", {})  # as the other stages name these options
+        return options_with(PreprocessingOptions, given, flags)
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
         for camera, value in _by_camera("--bottom-share", self.bottom_share):

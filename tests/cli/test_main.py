@@ -149,6 +149,7 @@ def test_options_are_listed_by_stage_key_and_plugin(megloc: Any) -> None:
     assert "aliked: options.threshold = 0.2\n" in megloc("options", "aliked").out
     assert "vlad: options." in megloc("options", "vlad").out
     assert "sweep: options." in megloc("options", "sweep").out
+    assert megloc("options", "inliers").out == "inliers has no options\n"
     assert megloc("options", "mvs.estimator", "--basic").out.startswith("mvs.estimator = ")
 
 

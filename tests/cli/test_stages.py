@@ -14,6 +14,7 @@ import pytest
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.cli.stages import Preprocess
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
@@ -227,6 +228,11 @@ def test_flags_are_converted_to_options() -> None:
     masks = options.masks
     assert masks.segmenter is not None and masks.segmenter.name == "deeplab"
     assert masks.dynamic == ("car", "bus") and masks.user_masks == Path("m") and masks.unchanging
+    # the names of other stages, too
+    again = flags("--undistort", "--set", "preprocessing.upscale=true").options()
+    assert (again.undistort, again.upscale) == (True, True)
+    with pytest.raises(OptionError, match="^unknown option upscal; "):
+        flags("--set", "upscal=true").options()
 
 
 def test_images_are_resized_and_masked(
