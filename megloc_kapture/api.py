@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.kapture_folders import fitted_camera, warn_of_scaled
-from megloc_kapture.errors import DataError, OptionError, require, suggestion
+from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import REPORT_HTML
 from megloc_kapture.features.image_bound import extract_bounded
@@ -48,7 +48,7 @@ from megloc_kapture.pipeline.map_making import (
 )
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset, options_with
-from megloc_kapture.pipeline.queries import Query, permitted_images
+from megloc_kapture.pipeline.queries import Query, check_image
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.plugin_loading import load_plugin
@@ -69,7 +69,8 @@ Files = list[str] | list[Path] | tuple[Path | str, ...]
 
 
 def _as_tuple(given: Any) -> tuple[Any, ...]:
-    return (given,) if isinstance(given, str | Path) else tuple(given)
+    single = isinstance(given, str | Path) or not isinstance(given, Iterable)
+    return (given,) if single else tuple(given)
 
 
 class Map:
@@ -92,7 +93,7 @@ class Map:
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
         """Return the localizer that :meth:`localize` uses with these pose refiners; cached."""
-        refiners = _as_tuple(refine)
+        refiners = _as_tuple(refine or ())
         if refiners not in self._localizers:
             options = self.options
             if refiners:
@@ -196,19 +197,6 @@ class Map:
         return Results(localizer, many, workers=workers)
 
 
-def check_image(image: Any) -> None:
-    """Raise DataError for anything but an image, such as a tensor, or None from cv2.imread."""
-    from PIL import Image
-
-    kind = type(image).__name__
-    if isinstance(image, np.ndarray):
-        kind = f"{image.dtype} {image.shape}"
-        fits = image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3 and image.size
-    else:
-        fits = isinstance(image, str | Path | Image.Image)
-    require(fits, f"an image is a file, uint8 (H, W, 3) RGB or a pillow image, got {kind}")
-
-
 def _query_of(
     image: Path | NDArray[np.uint8] | Image.Image,
     camera: Camera | None,
@@ -237,7 +225,7 @@ def _query_of(
             camera, image = photo.upright_camera, turned_upright(image, photo.orientation)
     elif camera is None:
         camera = guessed_camera(image.shape[1], image.shape[0])
-    return Query(camera, image, name, prior=permitted_images(prior), orientation=orientation)
+    return Query(camera, image, name, prior=prior, orientation=orientation)
 
 
 def open_map(

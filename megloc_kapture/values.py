@@ -113,8 +113,9 @@ class Camera:
             object.__setattr__(self, "width", int(self.width))
             object.__setattr__(self, "height", int(self.height))
             object.__setattr__(self, "params", tuple(float(p) for p in self.params))
-        except (TypeError, ValueError) as error:  # for example a matrix K
-            message = f"camera model {self.model}: sizes and params must be numbers"
+            object.__setattr__(self, "focal_deviation", float(self.focal_deviation))
+        except (TypeError, ValueError, OverflowError) as error:  # for example a matrix K
+            message = f"camera model {self.model}: sizes, params and deviation must be numbers"
             raise DataError(message) from error
         if len(self.params) != expected:
             raise DataError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,18 @@ def test_a_folder_is_localized_when_it_is_asked_for(
         (tmp_path / "mine").mkdir()
         (tmp_path / "mine" / "file").touch()
         results.save(tmp_path / "mine")
+
+
+def test_threads_share_results(built: megloc.Map, results: megloc.Results, scene: Path) -> None:
+    fresh = built.localize(scene / "query")
+    with ThreadPoolExecutor(4) as threads:
+        assert dict(zip(fresh, threads.map(fresh.get, fresh), strict=True)) == dict(results)
+
+
+def test_a_table_without_poses_has_their_columns(built: megloc.Map, tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48)).save(tmp_path / "black.png")
+    table = built.localize([tmp_path / "black.png"]).to_pandas()
+    assert list(table["status"]) == ["failed"] and table[["qw", "tz"]].isna().all(axis=None)
 
 
 def test_results_are_evaluated_as_they_are(
@@ -221,6 +234,8 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
         built.localize(scene / "query", prior=["0000.jpg"])
     with pytest.raises(megloc.DataError, match=r"has the candidate none\.jpg, which is not"):
         built.localize(next((scene / "query").rglob("*.jpg")), prior="none.jpg")
+    with pytest.raises(megloc.OptionError, match="--scale takes gps, or two photographs and"):
+        megloc.map_photographs(scene / "query", scale=2.0)  # type: ignore[arg-type]
     with pytest.raises(megloc.OptionError, match="has its own cameras"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)
@@ -247,6 +262,8 @@ def test_other_things_than_images_are_refused(built: megloc.Map, image: Any) -> 
     message = r"an image is a file, uint8 \(H, W, 3\) RGB or a pillow image, got "
     with pytest.raises(megloc.DataError, match=message):
         built.localize(image)
+    with pytest.raises(megloc.DataError, match=message):
+        built.localizer().localize(image, megloc.Camera.pinhole(8, 8, 8))
     with pytest.raises(megloc.DataError, match=message):
         megloc.extract("rootsift", image)
 

@@ -107,8 +107,15 @@ def test_a_camera_takes_numbers_of_any_kind() -> None:
         ("PINHOLE", 640, 480, (0, 500, 320, 240), "focal length 0.0 is not positive"),
         ("PINHOLE", 640, 480, (500, -500, 320, 240), "focal length -500.0 is not positive"),
         ("OPENCV_FISHEYE", 640, 480, (500, 0, 320, 240, 0, 0, 0, 0), "focal length 0.0"),
-        ("PINHOLE", 640, 480, np.eye(3), "PINHOLE: sizes and params must be numbers"),
-        ("SIMPLE_PINHOLE", "wide", 480, (500, 320, 240), "sizes and params must be numbers"),
+        ("PINHOLE", 640, 480, np.eye(3), "PINHOLE: sizes, params and deviation must be numbers"),
+        ("SIMPLE_PINHOLE", float("inf"), 480, (500, 320, 240), "deviation must be numbers"),
+        (
+            "SIMPLE_PINHOLE",
+            "wide",
+            480,
+            (500, 320, 240),
+            "sizes, params and deviation must be numbers",
+        ),
     ],
 )
 def test_cameras_that_cannot_be(

@@ -16,7 +16,7 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import Query, Unit, permitted_images
+from megloc_kapture.pipeline.queries import Query, Unit, check_image
 from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
@@ -87,8 +87,7 @@ class Localizer:
         camera : intrinsics with COLMAP's models and pixel origin.
         prior : names of map images that may be matched.
         """
-        query = _query_of(image, camera)
-        return self.localize_query(replace(query, prior=permitted_images(prior)))
+        return self.localize_query(replace(_query_of(image, camera), prior=prior))
 
     def localize_many(
         self,
@@ -183,4 +182,5 @@ class Localizer:
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:
+    check_image(image)
     return Query(camera, image, Path(image).name if isinstance(image, str | Path) else "query")

@@ -23,9 +23,23 @@ from megloc_kapture.stages.preprocessing import ClassMasks, PreprocessingOptions
 from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform, check_camera
 
 
-def permitted_images(prior: Sequence[str] | None) -> tuple[str, ...] | None:
-    """Return the names in a prior, which may be a single name."""
-    return (prior,) if isinstance(prior, str) else None if prior is None else tuple(prior)
+def check_image(image: Any) -> None:
+    """Raise DataError for anything but an image, such as a tensor, or None from cv2.imread."""
+    from PIL import Image
+
+    kind = type(image).__name__
+    if isinstance(image, np.ndarray):
+        kind = f"{image.dtype} {image.shape}"
+        fits = image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3 and image.size
+    else:
+        fits = isinstance(image, str | Path | Image.Image)
+    require(fits, f"an image is a file, uint8 (H, W, 3) RGB or a pillow image, got {kind}")
+
+
+def _names(images: Sequence[str] | None) -> tuple[str, ...] | None:
+    """Return names of map images as a tuple; a single name is a list of one."""
+    single = isinstance(images, str | Path)
+    return None if images is None else tuple(map(str, (images,) if single else images))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +51,7 @@ class Query:
     image : uint8 (H, W, 3) RGB or the path of an image file; optional if features are given.
     features, global_features : given features, by the map's types; missing local ones are
         extracted.
-    prior : map images that may be matched; None means all.
+    prior : map images that may be matched, or the name of one; None means all.
     candidates : map images to match, best first, instead of retrieval.
     mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may be missing.
     depth : depth map taken with the image, or a function that reads one; for ``icp``.
@@ -50,20 +64,22 @@ class Query:
     name: str = "query"
     features: Mapping[str, LocalFeatures] = field(default_factory=dict)
     global_features: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    prior: tuple[str, ...] | None = None
-    candidates: tuple[str, ...] | None = None
-    mask: Path | NDArray[np.bool_] | None = None
+    prior: Sequence[str] | None = None
+    candidates: Sequence[str] | None = None
+    mask: Path | str | NDArray[np.bool_] | None = None
     depth: DepthView | Callable[[], DepthView | None] | None = None
     orientation: int = 1
 
     def __post_init__(self) -> None:
         check_camera(self.camera)
+        object.__setattr__(self, "prior", _names(self.prior))
+        object.__setattr__(self, "candidates", _names(self.candidates))
 
     def read_mask(self) -> NDArray[np.bool_] | None:
         """Return the mask, bool (H, W), True = use, or None."""
         shape = (self.camera.height, self.camera.width)
-        if isinstance(self.mask, Path):
-            return read_mask(self.mask, shape)
+        if isinstance(self.mask, str | Path):
+            return read_mask(Path(self.mask), shape)
         if self.mask is None:
             return None
         mask = np.asarray(self.mask)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, check_option
@@ -66,13 +67,13 @@ class Results(Mapping[str, Pose | Failure]):
             self._found |= {name: unreadable_image(name, reason) for name, reason in broken.items()}
             self._found = dict(sorted(self._found.items()))
         self._stream = self._localized(workers, track)
+        self._lock = Lock()  # for threads that share the results
 
     def __getitem__(self, name: str) -> Pose | Failure:
-        outcome = self._found[name]
-        while outcome is None:
-            other, result = next(self._stream)
-            self._found[other] = result
-            outcome = self._found[name]
+        with self._lock:
+            while (outcome := self._found[name]) is None:
+                other, result = next(self._stream)
+                self._found[other] = result
         return outcome
 
     def __iter__(self) -> Iterator[str]:
@@ -111,6 +112,7 @@ class Results(Mapping[str, Pose | Failure]):
         rows = []
         for name, result in self.items():
             row = {**status_row(result), "image": name, "candidates": list(result.candidates)}
+            row |= dict.fromkeys(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), float("nan"))
             if isinstance(result, Pose):
                 pose = result.cam_from_world
                 row |= dict(zip(("qw", "qx", "qy", "qz"), pose.quat_wxyz, strict=True))

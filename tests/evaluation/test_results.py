@@ -213,8 +213,9 @@ def test_localization_results_have_reasons_and_inliers(world: Any) -> None:
 def test_arguments_from_python(world: Any, tmp_path: Path) -> None:
     """Rows of an array and texts are thresholds, and a pose may be None, as that of a Failure."""
     first, *_ = names = sorted(world.truth)
+    given: Any
     for given in ("0.1,1", ["0.1,1"], np.array([[0.1, 1.0]])):
-        actual = evaluate(world.truth, world.truth, thresholds=given)  # type: ignore[arg-type]
+        actual = evaluate(world.truth, world.truth, thresholds=given)
         assert actual.thresholds == (Threshold(position_m=0.1, angle_deg=1.0),)
     poses: dict[Any, Any] = {Path(name): world.truth[name] for name in names}
     row = evaluate({**poses, Path(first): None}, world.truth).row()

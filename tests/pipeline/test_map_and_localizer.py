@@ -269,7 +269,7 @@ def queries(workspace: Path, scene: Path) -> list[Query]:
     ("image", "message"),
     [
         (np.zeros((10, 10, 3), np.uint8), r"image uint8 \(300, 400, 3\), got uint8 \(10, 10, 3\)"),
-        (np.zeros((300, 400, 3)), r"image uint8 \(300, 400, 3\), got float64"),
+        (np.zeros((300, 400, 3)), r"an image is a file, uint8 \(H, W, 3\) .*, got float64"),
     ],
     ids=["size", "float"],
 )
@@ -291,6 +291,7 @@ def test_masked_pixels_have_no_features(
     whole = localizer.localize_query(query)
     assert isinstance(half, Pose) and isinstance(whole, Pose)
     assert half.num_matches != whole.num_matches
+    assert replace(query, mask=str(image.with_name("no_mask.png"))).read_mask() is None
     with pytest.raises(DataError, match="a mask is bool"):
         localizer.localize_query(replace(query, mask=mask[:10]))
 
@@ -303,6 +304,8 @@ def test_a_prior_restricts_the_candidates(
     assert set(found.candidates) == {"0003.jpg", "0005.jpg"}
     assert errors(found, truth.cam_from_world("0004.jpg"))[0] < 0.05
     assert localizer.localize(image, camera, prior="0003.jpg").candidates == ("0003.jpg",)
+    query = Query(camera, image, prior="0003.jpg")
+    assert query.prior == ("0003.jpg",) == replace(query, prior=[Path("0003.jpg")]).prior  # type: ignore[list-item]
     assert localizer.localize(image, camera, prior=[]) == Failure("no map image is a candidate")
     with pytest.raises(DataError, match=r"0004\.jpg has the candidate 0001\.jpg, which is not"):
         localizer.localize(image, camera, prior=["0003.jpg", "0001.jpg"])
