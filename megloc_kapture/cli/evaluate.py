@@ -19,7 +19,7 @@ from megloc_kapture.cli.common import (
     Overwrite,
     existing,
 )
-from megloc_kapture.errors import DataError, OptionError, check_option, require
+from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.output_folders import staged_output
 
 EVALUATION = "evaluation"
@@ -95,7 +95,7 @@ class Evaluate(Common):
         twice = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
         check_option(twice is None, f"{twice} is given twice")
         check_option(self.align == "none" or self.gt is not None, "--align needs true poses (--gt)")
-        existing([path for path in (self.side_tables, self.map) if path is not None])
+        existing([] if self.map is None else [self.map])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,15 +118,20 @@ class Submit(Common):
     """Overwrite the pose file and its JSON file."""
 
     def run(self) -> None:
-        from megloc_kapture.io.dataset_tables import Protocol, read_protocol, tables_of
+        from megloc_kapture.io.dataset_tables import (
+            Protocol,
+            check_tables,
+            read_protocol,
+            tables_of,
+        )
         from megloc_kapture.pipeline.submission import (
             check_dataset,
             workspace_provenance,
             write_submission,
         )
 
-        if self.side_tables is not None and not self.side_tables.is_dir():
-            raise DataError("no such folder", path=self.side_tables)
+        if self.side_tables is not None:
+            check_tables(self.side_tables)
         tables = self.side_tables or tables_of(self.input)
         rules = Protocol() if tables is None else read_protocol(tables)
         check_dataset(self.dataset, rules, tables=tables)

@@ -41,6 +41,7 @@ from megloc_kapture.io.dataset_tables import (
     SideTables,
     SimilarityTransform,
     World,
+    check_tables,
     read_nowhere,
     unit_of,
 )
@@ -96,8 +97,7 @@ def evaluate(
     align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
     """
     check_option(align in get_args(Align), f"align is {align!r}; give none, se3 or sim3")
-    for folder in (side_tables, mapping):
-        require(folder is None or Path(folder).is_dir(), "no such folder", path=folder)
+    require(mapping is None or Path(mapping).is_dir(), "no such folder", path=mapping)
     benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
     given = () if thresholds is None else thresholds
@@ -124,6 +124,8 @@ def benchmark_beside(
     beside: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
 ) -> SideTables:
     """Return the benchmark of ``side_tables``, or of the first path that is in a workspace."""
+    if side_tables is not None:
+        check_tables(side_tables)
     for path in beside:
         if isinstance(path, Path | str):
             side_tables = side_tables or side_tables_near(path)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, field_validator
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.csv_table import ImageName, columns_of, read_records, write_csv_table
 from megloc_kapture.io.files import (
     ModelT,
@@ -264,6 +264,17 @@ class SideTables:
 
 
 NO_TABLES = SideTables()
+
+
+def check_tables(folder: Path | str) -> None:
+    """Raise DataError unless the folder, which a user named, has tables."""
+    place = Path(folder)
+    require(place.is_dir(), "no such folder", path=place)
+    require(
+        any((place / name).is_file() for name in (PROTOCOL_FILE, GROUPS_FILE)),
+        f"neither {PROTOCOL_FILE} nor {GROUPS_FILE}; give the folder {SIDE_TABLES}/",
+        path=place,
+    )
 
 
 def read_side_tables(folder: Path) -> SideTables:

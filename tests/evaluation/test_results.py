@@ -226,6 +226,7 @@ def test_arguments_from_python(world: Any, tmp_path: Path) -> None:
         ({"align": "sim"}, "align is 'sim'; give none, se3 or sim3"),
         ({"align": None}, "align is None; give"),
         ({"side_tables": tmp_path / "no"}, "no: no such folder"),
+        ({"side_tables": tmp_path}, r"neither protocol\.json nor groups\.csv; give the folder m"),
         ({"mapping": tmp_path / "no"}, "no: no such folder"),
     ):
         with pytest.raises(MeglocError, match=message):
