@@ -245,6 +245,8 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
         megloc.open_map(tmp_path / "nowhere").localize(scene / "query")
     with pytest.raises(megloc.DataError, match="features: no such folder of features"):
         megloc.open_map(built.kapture_map.folder.root, features_dirs="features")
+    with pytest.raises(megloc.OptionError, match=r"give map=m\.kapture_map for a Map m"):
+        megloc.export("ply", tmp_path / "map.ply", map=built)  # type: ignore[arg-type]
     with pytest.raises(megloc.OptionError, match=r"KaptureMap\.open"):
         megloc.Localizer(str(built.kapture_map.folder.root))  # type: ignore[arg-type]
     with pytest.raises(megloc.OptionError, match="needs a reference model"):

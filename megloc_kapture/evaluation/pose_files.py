@@ -173,8 +173,8 @@ def poses_by_image(
     by_stem: dict[str, set[str]] = {}
     for name, image in (*listed.items(), *((end, i) for end, all_ in by_end.items() for i in all_)):
         by_stem.setdefault(_stem(name), set()).add(image)
-    renamed: dict[str, RigidTransform] = {}
-    for name, pose in poses.items():
+    named: dict[str, str] = {}
+    for name in poses:
         fitting = [name] if name in known else by_end.get(name, [])
         if name in listed:
             fitting = [listed[name]]
@@ -186,10 +186,12 @@ def poses_by_image(
             fitting = list(alike) if len(alike) == 1 else [name]
         if len(fitting) > 1:
             raise DataError(f"{name!r} may be {fitting[0]!r} or {fitting[1]!r}; use full names")
-        if fitting[0] in renamed:
-            raise DataError(f"the pose file names image {fitting[0]!r} in two ways")
-        renamed[fitting[0]] = pose
-    return renamed
+        if other := named.get(fitting[0]):
+            raise DataError(
+                f"image {fitting[0]!r} is named in two ways: {other!r}, {name!r}; use full names"
+            )
+        named[fitting[0]] = name
+    return {image: poses[name] for image, name in named.items()}
 
 
 def _ends(image: str) -> list[str]:

@@ -253,6 +253,10 @@ def export(
     if map is None and query is None:
         raise OptionError("nothing to export: give a map, or localized queries")
     check_option(
+        isinstance(map, KaptureMap | Path | str | None) and isinstance(query, Path | str | None),
+        "give map=m.kapture_map for a Map m, and query=FOLDER for the folder of saved Results",
+    )
+    check_option(
         not undistort or name == "colmap", f"--undistort is an option of colmap, not of {name}"
     )
     images, points = _read(map, query, sensor, trajectory=name == "tum")

@@ -108,7 +108,7 @@ class KaptureMap:
         cls,
         path: Path | str,
         *,
-        keypoints_types: Sequence[str] = (),
+        keypoints_types: Sequence[str] | str = (),
         features_dirs: Sequence[Path | str] | Path | str = (),
         pixel_origin: PixelOriginChoice = "auto",
     ) -> KaptureMap:
@@ -116,7 +116,7 @@ class KaptureMap:
 
         Parameters
         ----------
-        keypoints_types : types used for localization; by default all that have points.
+        keypoints_types : type or types used for localization; by default all that have points.
         features_dirs : additional feature folders in the orphan layout.
         pixel_origin : origin of the map's intrinsics; "auto" estimates it (see ``.pixel_origin``).
         """
@@ -136,7 +136,8 @@ class KaptureMap:
             "missing, or they have other timestamps or sensors",
             path=folder.root,
         )
-        indices = _read_indices(folder, keypoints_types)
+        types = [keypoints_types] if isinstance(keypoints_types, str) else keypoints_types
+        indices = _read_indices(folder, types)
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
             origins = {

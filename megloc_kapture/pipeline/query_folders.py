@@ -462,7 +462,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         else:
             raise DataError("no such file or folder", path=path)
         for name, file in files.items():
-            if name in by_name:
+            if by_name.get(name, file) != file:
                 raise DataError(
                     f"{by_name[name]} would have the same name; give a common parent folder",
                     path=file,

@@ -152,7 +152,7 @@ def test_short_names_are_matched_with_images() -> None:
     assert list(result) == ["q/day/1.jpg", "q/day/2.jpg", "9.jpg"]
     with pytest.raises(DataError, match="may be 'q/day/2.jpg' or 'q/night/2.jpg'"):
         poses_by_image({"2.jpg": HERE}, images)
-    with pytest.raises(DataError, match="in two ways"):
+    with pytest.raises(DataError, match=r"in two ways: '1\.jpg', 'q/day/1\.jpg'; use full names"):
         poses_by_image({"1.jpg": HERE, "q/day/1.jpg": HERE}, images)
     listed = {"dawn/rear/1.jpg": "rear/1.png", "dusk/rear/2.jpg": "rear/2.png"}
     result = poses_by_image({"rear/1.png": HERE, "dusk/rear/2.jpg": HERE}, listed, listed)

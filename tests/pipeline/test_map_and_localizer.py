@@ -117,7 +117,7 @@ def test_all_types_are_used_unless_some_are_chosen(map_copy: Path) -> None:
     add_type(map_copy, "other")
     both = KaptureMap.open(map_copy)
     assert list(both.keypoints) == ["other", "rootsift"]
-    opened = KaptureMap.open(map_copy, keypoints_types=["other"])
+    opened = KaptureMap.open(map_copy, keypoints_types="other")
     assert list(opened.keypoints) == ["other"]
     # the configuration has the name of the extractor
     assert opened.keypoints["other"].extractor() == PluginChoice(name="rootsift")
