@@ -21,7 +21,6 @@ from megloc_kapture.datasets.kapture_folders import fitted_camera, warn_of_scale
 from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import REPORT_HTML
-from megloc_kapture.features.image_bound import extract_bounded
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import (
@@ -53,6 +52,8 @@ from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
+from megloc_kapture.stages.local_features import extract_all
+from megloc_kapture.stages.matches import match_all
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, MAP, Stage
 from megloc_kapture.stages.work import Work
@@ -407,10 +408,12 @@ def extract(
     extractor's. PluginError or MissingWeightsError if the extractor cannot be loaded.
     """
     check_image(image)
+    name = "given"
     if isinstance(image, str | Path):
-        image = read_image_rgb(image)
+        name, image = str(image), read_image_rgb(image)
     pixels = image if isinstance(image, np.ndarray) else pillow_pixels(image)
-    extracted = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), [(pixels, None)])[0]
+    extractor = load_plugin(LOCAL_FEATURES, features, options)
+    extracted = extract_all(extractor, [(pixels, None)], [name])[0]
     height, width = pixels.shape[:2]
     return ImageFeatures(extracted.keypoints_px, extracted.descriptors, width, height)
 
@@ -422,9 +425,7 @@ def match(
 
     PluginError or MissingWeightsError if the matcher cannot be loaded.
     """
-    matches: tuple[NDArray[np.int64], NDArray[np.float32]]
-    matches = load_plugin(MATCHERS, matcher, options).match(first, second)
-    return matches
+    return match_all(load_plugin(MATCHERS, matcher, options), first, [second], ["the images"])[0]
 
 
 def solve_pose(

@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import PluginError
+import megloc_kapture as megloc
+from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.plugin_loading import checked_array, load_plugin, plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
-from megloc_kapture.values import LocalFeatures
+from megloc_kapture.stages.local_features import _extract
+from megloc_kapture.values import ImageFeatures, LocalFeatures
 
 MODULE = """
     import numpy as np
@@ -183,3 +186,23 @@ def test_arrays_of_plugins_are_checked(array: Any, message: str) -> None:
         checked_array("plugin x", array, (None, 2), "float32", "uint8")
     whole = np.ones((3, 2), np.uint8)
     assert checked_array("plugin x", whole, (None, 2), "float32", "uint8") is whole
+
+
+def test_outputs_are_checked_from_python(outside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.zeros((100, 100, 3), np.uint8)
+    assert len(megloc.extract("grid", image).keypoints_px) == 4
+    kind = type(load_plugin(LOCAL_FEATURES, "grid"))
+    monkeypatch.setattr(kind, "extract", lambda *_: np.zeros((5, 2)))
+    with pytest.raises(PluginError, match="'grid' on image given: got ndarray, expected LocalF"):
+        megloc.extract("grid", image)
+
+    def reject(*_: object) -> None:
+        raise DataError("too small")
+
+    monkeypatch.setattr(kind, "extract", reject)
+    with pytest.raises(DataError, match=r"^a\.png: too small"):
+        _extract(load_plugin(LOCAL_FEATURES, "grid"), [("a.png", Any)], [(image, None)])  # type: ignore[list-item]
+    monkeypatch.setattr(NearestNeighbours, "match", lambda *_: np.zeros((3, 2)))
+    features = ImageFeatures(np.zeros((1, 2), np.float32), np.zeros((1, 4)), 8, 8)
+    with pytest.raises(PluginError, match=r"got ndarray, expected \(matches, scores\)"):
+        megloc.match("nn", features, features)

@@ -161,7 +161,13 @@ class QueryImage(ProcessedFrame):
         return None if mask is None else with_margin(mask, self._mask_margin_px)
 
     def extract(self, extractor: LocalFeatureExtractor) -> LocalFeatures:
-        return extract_all(extractor, [(self.pixels, self.feature_mask)], [self.query.name])[0]
+        file = self.query.image
+        try:
+            return extract_all(extractor, [(self.pixels, self.feature_mask)], [self.query.name])[0]
+        except DataError as error:  # an image that the extractor rejects fails alone
+            if error.path is not None or not isinstance(file, str | Path):
+                raise
+            raise DataError(error.message, path=file) from error
 
     def describe(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
         """Return the global feature, float32 (D,)."""

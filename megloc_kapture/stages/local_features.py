@@ -120,7 +120,13 @@ def _read(margin_px: float, job: Job) -> Frame:
 def _extract(
     extractor: LocalFeatureExtractor, jobs: Sequence[Job], frames: Sequence[Frame]
 ) -> list[LocalFeatures]:
-    return extract_all(extractor, frames, [image for image, _ in jobs])
+    names = [image for image, _ in jobs]
+    try:
+        return extract_all(extractor, frames, names)
+    except DataError as error:  # of a plugin, which knows no names
+        if error.path is not None:
+            raise
+        raise DataError(error.message, path=" or ".join(names)) from error
 
 
 def mask_path(folder: KaptureFolder, image: str) -> Path:

@@ -354,3 +354,14 @@ def test_an_unreadable_image_among_many_fails_alone(
     results = list(localizer.localize_many([(kind(broken), camera), queries[0]]))
     assert isinstance(results[0], Failure) and str(broken) in results[0].reason
     assert isinstance(results[1], Pose)
+
+
+def test_an_image_that_the_extractor_rejects_fails_alone(
+    localizer: Localizer, image: Path, truth: KaptureData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def reject(*_: object) -> None:
+        raise DataError("too small")
+
+    monkeypatch.setattr(RootSift, "extract", reject)
+    (failure,) = localizer.localize_many([(image, truth.camera_of("0004.jpg"))])
+    assert isinstance(failure, Failure) and failure.reason.endswith("too small")
