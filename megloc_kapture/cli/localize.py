@@ -201,7 +201,7 @@ class Serve(Reading, Deciding, Common):
             localizer = prepared_localizer(kapture_map, options)
             host = f"[{self.host}]" if ":" in self.host else self.host
             where = f"http://{host}:{bound.getsockname()[1]}/"
-            print(f"listening at {where}, {len(kapture_map.images)} map images")
+            print(f"{len(kapture_map.images)} map images, listening at {where}")
             log_requests = logging.getLogger().isEnabledFor(logging.INFO)
             service = Service(localizer, **limits, token=token)
             try:

@@ -107,7 +107,7 @@ def served(served_map: Path, temporary: Path) -> Iterator[tuple[subprocess.Popen
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
-        assert "listening at " in line and "7 map images" in line, process.communicate()
+        assert "7 map images, listening at " in line, process.communicate()
         yield process, line.split()[-1]
     finally:
         process.kill()
