@@ -163,8 +163,10 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
             if path.name == TEXT_FILES[1]:
                 text, names = _images_for_pycolmap(path, paths[0])
                 link.write_text(text, encoding="utf-8")
-            elif path.suffix == ".txt":  # without a byte order mark
-                link.write_text(_SIZE.sub(r"\1\2", read_text(path)), encoding="utf-8")
+            elif path.suffix == ".txt":
+                text = read_text(path)  # without a byte order mark
+                is_cameras = path.name == TEXT_FILES[0]
+                link.write_text(_SIZE.sub(r"\1\2", text) if is_cameras else text, encoding="utf-8")
             else:
                 link.symlink_to(path.resolve())
         if not with_points:
