@@ -168,10 +168,10 @@ def remove(path: Path) -> None:
 # ------------------------------------------------------------------------------------ writing
 
 
-def output_error(path: Path | str, error: OSError) -> OutputError:
+def output_error(path: Path | str, error: OSError, *, remedy: str = "") -> OutputError:
     """Return the :class:`OutputError` for an ``OSError`` from writing ``path``."""
     reason = error.strerror or str(error) or type(error).__name__
-    return OutputError(f"{path}: cannot write: {reason}{_broken_link(Path(path))}")
+    return OutputError(f"{path}: cannot write: {reason}{_broken_link(Path(path))}{remedy}")
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ from megloc_kapture.datasets.colmap_map import (
     naming_lasting_files,
 )
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
-from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, require
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
     METRES,
@@ -339,8 +339,8 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
         remove(kept)
         made.rename(kept)
     except OSError as error:
-        message = f"{output_error(folder, error)}; XDG_CACHE_HOME sets another cache folder"
-        raise OutputError(message) from error
+        remedy = "; XDG_CACHE_HOME sets another cache folder"
+        raise output_error(folder, error, remedy=remedy) from error
     finally:
         with contextlib.suppress(OSError):
             remove(made)

@@ -360,8 +360,8 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, track: Track | Non
     except ValueError as error:  # pooch: wrong sha256
         raise DataError(f"the download is not the published file: {error}", path=url) from error
     except OSError as error:
-        message = f"{output_error(path, error)}; {FOLDER_VARIABLE} sets another folder of weights"
-        raise OutputError(message) from error
+        remedy = f"; {FOLDER_VARIABLE} sets another folder of weights"
+        raise output_error(path, error, remedy=remedy) from error
 
 
 def add_weights(
