@@ -32,6 +32,7 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
+from megloc_kapture.io.kapture.features import features_dir_hint
 from megloc_kapture.io.output_folders import check_new_file
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import Workspace, run_plan
@@ -81,8 +82,7 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
     elif types:
         reason = f"several types of {kind}, choose one: {present}"
     else:
-        layout = "global_features" if kind == "global_features" else "local_features"
-        reason = f"no {kind}; --features-dir FOLDER adds those in FOLDER/{layout}/TYPE/{kind}"
+        reason = f"no {kind}; {features_dir_hint(kind)}"  # type: ignore[arg-type]
     raise OptionError(f"{folder.root}: {reason}")
 
 

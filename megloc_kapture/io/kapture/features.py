@@ -77,6 +77,11 @@ def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: boo
     return parent / kind if orphan else parent
 
 
+def features_dir_hint(kind: FeatureKind) -> str:
+    place = feature_folder(Path("FOLDER"), kind, "TYPE", orphan=True)
+    return f"--features-dir FOLDER adds those in {place}"
+
+
 def has_features(root: Path, kind: ArrayKind, type_name: str, image: str) -> bool:
     """Return whether an image has a feature file (not in a tar) in the orphan layout."""
     folder = feature_folder(root, kind, type_name, orphan=True)

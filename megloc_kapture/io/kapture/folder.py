@@ -20,6 +20,7 @@ from megloc_kapture.io.kapture.features import (
     FeatureKind,
     FeatureReader,
     feature_folder,
+    features_dir_hint,
     list_types,
 )
 from megloc_kapture.io.kapture.format import KaptureData
@@ -168,10 +169,9 @@ class KaptureFolder:
         if not folders:
             searched = ", ".join(str(root) for root, _ in candidates)
             present = ", ".join(self.types(kind)) or "none"
-            layout = "global_features" if kind == "global_features" else "local_features"
             raise DataError(
                 f"no {kind} of type {type_name!r} in {searched}; there are: {present} "
-                f"(--features-dir FOLDER adds those in FOLDER/{layout}/{type_name}/{kind})"
+                f"({features_dir_hint(kind)})"
             )
         return folders
 
