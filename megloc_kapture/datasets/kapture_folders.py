@@ -24,7 +24,6 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import check_relative, link_images
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, RigidTransform
@@ -237,7 +236,7 @@ def cameras_of_folder(folder: KaptureFolder) -> tuple[dict[str, Camera], list[Da
     known = {
         sensor_id: data.sensors[sensor_id].camera()
         for sensor_id in taken
-        if data.sensors[sensor_id].params[:1] != (UNKNOWN_CAMERA,)
+        if not data.sensors[sensor_id].is_unknown
     }
     images = (
         (sensor_id, folder.image_path(name))

@@ -43,7 +43,6 @@ from megloc_kapture.io.kapture import (
     Sensor,
     writable_name,
 )
-from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
 from megloc_kapture.io.text_lines import find_camera
 from megloc_kapture.matching.guided_pyramid import base_type
@@ -180,7 +179,7 @@ class KaptureQueries(Queries):
         return self._data
 
     def _is_unknown(self, name: str) -> bool:
-        return self._sensor(name).params[:1] == (UNKNOWN_CAMERA,)
+        return self._sensor(name).is_unknown
 
     def _sensor(self, name: str) -> Sensor:
         return self._data.sensors[self._data.record_of(name)[1]]

@@ -26,7 +26,6 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
@@ -339,7 +338,7 @@ def _refine(
 ) -> Pose:
     image, pose, references, distrusted = job
     data = query.read()
-    if data.sensors[data.record_of(image)[1]].params[:1] == (UNKNOWN_CAMERA,):
+    if data.sensors[data.record_of(image)[1]].is_unknown:
         query = localized  # it has the camera that was estimated with the pose
     scene, camera = KaptureScene(mapping, query), query.read().camera_of(image)
     return apply_refiners(image, camera, pose, references, distrusted, refiners, scene)

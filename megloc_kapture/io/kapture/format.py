@@ -39,10 +39,15 @@ class Sensor:
     sensor_type: str
     params: tuple[str, ...]
 
+    @property
+    def is_unknown(self) -> bool:
+        """Whether this is a camera without intrinsics (``UNKNOWN_CAMERA``)."""
+        return self.params[:1] == (UNKNOWN_CAMERA,)
+
     def camera(self) -> Camera:
         if self.sensor_type not in CAMERA_SENSOR_TYPES:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
-        if self.params[:1] == (UNKNOWN_CAMERA,):
+        if self.is_unknown:
             raise DataError(
                 "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics, or estimate them: "
                 "`megloc localize --query` does so for queries, `megloc map` for map images"

@@ -108,7 +108,7 @@ def check_sensor(sensor: Sensor) -> None:
     """
     if sensor.sensor_type not in CAMERA_SENSOR_TYPES:
         return
-    if sensor.params[:1] != (UNKNOWN_CAMERA,):
+    if not sensor.is_unknown:
         sensor.camera()
     elif len(sensor.params) != 3 or not all(re.fullmatch("[0-9]+", p) for p in sensor.params[1:]):
         raise DataError(f"{UNKNOWN_CAMERA} takes a width and a height in whole pixels")
