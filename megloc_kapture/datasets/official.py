@@ -29,14 +29,14 @@ from megloc_kapture.io.dataset_tables import (
     read_groups,
     write_side_tables,
 )
-from megloc_kapture.io.files import link_records
+from megloc_kapture.io.files import find_near, link_records
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.output_folders import ARCHIVES
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 GROUND_TRUTH = "ground_truth"
 REFERENCE = "reference"
 _MISSING_SHOWN = 5
-_ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz")
 
 
 class DatasetCard(Options):
@@ -77,9 +77,9 @@ def kapture_hint(root: Path) -> str:
 
 
 def archives(root: Path) -> list[Path]:
-    """Return the paths of archives below ``root``, relative to it."""
-    files = root.rglob("*")
-    return sorted(path.relative_to(root) for path in files if path.name.lower().endswith(_ARCHIVES))
+    """Return the paths of archives near ``root``, relative to it."""
+    files = find_near(root, "*")
+    return sorted(path.relative_to(root) for path in files if path.name.lower().endswith(ARCHIVES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,11 +297,11 @@ class KaptureForm:
         The size of one image per camera and folder is checked.
         """
         images: dict[str, KaptureImage] = {}
-        if all(path.name == "mapping" for path in self.folders):
-            missing.files.append(self.folders[0].with_name("query"))
+        if all(path.name == MAPPING for path in self.folders):
+            missing.files.append(self.folders[0].with_name(QUERY))
         for path in self.folders:
             folder = KaptureFolder(path)
-            if path.name == "mapping":
+            if path.name == MAPPING:
                 missing.require(path / "sensors" / "trajectories.txt")
             data = folder.read()
             number = path.parent.name

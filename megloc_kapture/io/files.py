@@ -222,6 +222,12 @@ def user_cache() -> Path:
     return Path(cache) / "megloc-kapture"
 
 
+def find_near(root: Path, pattern: str) -> Iterator[Path]:
+    """Find files and folders in ``root`` and three levels of folders; ``root`` may be a disk."""
+    for depth in range(4):
+        yield from root.glob(f"{'*/' * depth}{pattern}")
+
+
 # -------------------------------------------------------------------------------------- links
 
 

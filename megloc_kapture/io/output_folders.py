@@ -24,7 +24,7 @@ from megloc_kapture.io.files import (
 )
 
 MARKER = ".megloc"
-_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 
 
 def claim_folder(folder: Path, *, kind: str, force: bool = False) -> bool:
@@ -168,7 +168,7 @@ def files_below(*folders: Path) -> Iterator[Path]:
         for place, names, files in os.walk(root, followlinks=True):
             here = Path(place)
             names[:] = [name for name in names if _is_data(here, name)]
-            shown = (here / n for n in files if not (n.startswith(".") or n.endswith(_ARCHIVES)))
+            shown = (here / n for n in files if not (n.startswith(".") or n.endswith(ARCHIVES)))
             yield from (path for path in shown if path.is_file())
 
 

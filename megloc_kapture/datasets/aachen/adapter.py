@@ -30,7 +30,7 @@ from megloc_kapture.errors import OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.io.dataset_tables import ImageGroup, World
-from megloc_kapture.io.files import named
+from megloc_kapture.io.files import find_near, named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.io.text_lines import read_camera_rows
@@ -106,7 +106,7 @@ class Layout:
         """Return ``wanted``, or the latest version that has a model."""
         if wanted == "auto":
             wanted = "1.1" if self.colmap_model.is_dir() else "1.0"
-            stray = next(self.root.rglob("aachen_v*1_1*"), None) if wanted == "1.0" else None
+            stray = next(find_near(self.root, "aachen_v*1_1*"), None) if wanted == "1.0" else None
             require(
                 stray is None,
                 f"v1.1's {stray} is not in place: its model belongs in {self.colmap_model}/, its "

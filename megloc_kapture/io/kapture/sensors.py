@@ -14,7 +14,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_relative, remove, write_bytes
+from megloc_kapture.io.files import check_relative, find_near, remove, write_bytes
 from megloc_kapture.io.kapture.format import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
@@ -55,8 +55,7 @@ def read_kapture_data(root: Path) -> KaptureData:
         if inner:
             raise DataError(f"not a kapture folder; it has {inner}: give one of them", path=root)
         # nerfstudio has colmap/sparse/0, COLMAP's dense reconstruction dense/0/sparse
-        places = [f"{'*/' * depth}points3D.*" for depth in range(4)]
-        if models := sorted(path.parent for place in places for path in root.glob(place)):
+        if models := sorted(path.parent for path in find_near(root, "points3D.*")):
             raise DataError(
                 f"not a kapture folder; there is a COLMAP model in {models[0]}, of which `megloc "
                 "import colmap` makes a map",
