@@ -176,7 +176,7 @@ class RigidTransform:
         matrix = np.asarray(rotation, dtype=np.float64)
         if matrix.shape != (3, 3):
             raise DataError(f"a rotation matrix has the shape (3, 3), got {matrix.shape}")
-        is_orthonormal = np.allclose(matrix.T @ matrix, np.eye(3), rtol=0, atol=0.01)
+        is_orthonormal = np.abs(matrix.T @ matrix - np.eye(3)).max() <= 0.01  # False for nan
         if not is_orthonormal or np.linalg.det(matrix) < 0:
             raise DataError(f"not a rotation matrix: {matrix.tolist()}")
         (a, b, c), (d, e, f), (g, h, i) = matrix
