@@ -12,6 +12,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, check_option
+from megloc_kapture.evaluation.pose_files import COLUMNS
 from megloc_kapture.io.dataset_tables import METRES, write_unit
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Candidates = Mapping[str, Sequence[str]]
+_POSE = COLUMNS.split()[1:]
 
 
 class Results(Mapping[str, Pose | Failure]):
@@ -112,12 +114,10 @@ class Results(Mapping[str, Pose | Failure]):
         rows = []
         for name, result in self.items():
             row = {**status_row(result), "image": name, "candidates": list(result.candidates)}
-            row |= dict.fromkeys(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), float("nan"))
+            numbers: tuple[float, ...] = (float("nan"),) * len(_POSE)
             if isinstance(result, Pose):
-                pose = result.cam_from_world
-                row |= dict(zip(("qw", "qx", "qy", "qz"), pose.quat_wxyz, strict=True))
-                row |= dict(zip(("tx", "ty", "tz"), pose.translation, strict=True))
-            rows.append(row)
+                numbers = (*result.cam_from_world.quat_wxyz, *result.cam_from_world.translation)
+            rows.append({**row, **dict(zip(_POSE, numbers, strict=True))})
         return pd.DataFrame(rows).set_index("image")
 
     def view(self, path: Path | str, truth: Path | str | None = None) -> None:
