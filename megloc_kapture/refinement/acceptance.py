@@ -29,6 +29,12 @@ CHI2_OF_CHANCE = 22.46
 _LEAST_PX = 1e-3
 Float64 = NDArray[np.float64]
 _CHANGE = 0.5  # largest change of the residuals by a finite difference, in standard deviations
+# smallest accepted decrease of the robust cost, in standard errors
+_MIN_SIGNIFICANCE = 2.5
+# smallest accepted correlation of the query with the warped references
+MIN_CORRELATION = 0.12
+# share of the overlap at the old pose that the new pose may lose
+_MAX_OVERLAP_LOSS = 0.1
 # the curvature of the objective must be at least this share of that of the normal equations
 _LEAST_SHARE = 0.02
 # displacement of points on either side of a finite difference, in pixels of the level
@@ -48,18 +54,8 @@ class RenderingOptions(Options):
     max_references: int = Field(
         default=4, gt=0, description="largest number of reference images with depth"
     )
-    max_points: int = Field(
-        default=12000,
-        ge=MIN_POINTS,
-        description="largest number of points per reference and pyramid level",
-    )
     max_side_px: int = Field(
         default=640, ge=64, description="longer side of the finest level; larger images are reduced"
-    )
-    levels: int = Field(
-        default=3,
-        ge=1,
-        description="number of pyramid levels, each half the size of the previous one",
     )
     max_translation_m: float = Field(
         default=0.5, gt=0, description="largest accepted movement of the camera centre"
@@ -73,26 +69,6 @@ class RenderingOptions(Options):
         default=False,
         description="accept every refined pose without tests; require_consistent_map still tests "
         "the map",
-    )
-    min_significance: float = Field(
-        default=2.5,
-        ge=0,
-        description="smallest accepted decrease of the robust cost, in standard errors",
-    )
-    min_correlation: float = Field(
-        default=0.12,
-        ge=-1,
-        le=1,
-        description="smallest accepted correlation of the query with the warped references",
-    )
-    min_overlap: float = Field(
-        default=0.2, ge=0, le=1, description="share of the query that the references must cover"
-    )
-    max_overlap_loss: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="share of the overlap at the old pose that the new pose may lose",
     )
 
 
@@ -128,7 +104,7 @@ def accept_or_keep(
         measures["squared_distance"] = squared_distance(start, pose, uncertainty)
     if options.accept_always:
         return PoseRefinement(pose, "", measures, uncertainty)
-    reason = _too_far(moved_m, turned_deg, options) or _no_better(measures, options)
+    reason = _too_far(moved_m, turned_deg, options) or _no_better(measures)
     if reason:
         return PoseRefinement(start, reason, measures)
     if uncertainty is None:
@@ -169,22 +145,22 @@ def _too_far(moved_m: float, turned_deg: float, options: RenderingOptions) -> st
     return ""
 
 
-def _no_better(measures: Mapping[str, float], options: RenderingOptions) -> str:
+def _no_better(measures: Mapping[str, float]) -> str:
     correlation_after, significance = measures["correlation_after"], measures["significance"]
     overlap, overlap_after = measures["overlap_before"], measures["overlap_after"]
     if measures["points"] < MIN_POINTS:
         return f"only {measures['points']:.0f} points are seen from both poses"
-    if correlation_after < options.min_correlation:
+    if correlation_after < MIN_CORRELATION:
         return (
             f"the correlation of references and query is {correlation_after:.2f}, "
-            f"less than {options.min_correlation:g}"
+            f"less than {MIN_CORRELATION:g}"
         )
-    if significance < options.min_significance:
+    if significance < _MIN_SIGNIFICANCE:
         return (
             f"the cost decreases by {significance:.1f} standard errors, "
-            f"less than {options.min_significance:g}"
+            f"less than {_MIN_SIGNIFICANCE:g}"
         )
-    if overlap_after < (1.0 - options.max_overlap_loss) * overlap:
+    if overlap_after < (1.0 - _MAX_OVERLAP_LOSS) * overlap:
         return f"the overlap falls from {overlap:.0%} to {overlap_after:.0%}"
     return ""
 

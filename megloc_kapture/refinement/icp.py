@@ -42,6 +42,18 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
 
+# map images with depth: those that overlap most, without similar views
+_MAX_REFERENCES = 10
+# smallest number of points in either cloud at the finest voxels
+_MIN_POINTS = 1000
+# smallest share of the query's points close to the map: within the first of max_distances_m before
+# refinement, within the last after it
+_MIN_OVERLAP = 0.5
+# largest accepted rotation; the largest accepted movement is the first of max_distances_m
+_MAX_MOVED_DEG = 10.0
+# largest condition number of the normal matrix at the coarsest level; above it the surfaces do not
+# determine the pose: a bare wall has 10000, a corridor 2000, a furnished room 15
+_MAX_CONDITION = 100.0
 # query pixels in the last step; more take longer but have no effect
 _MAX_PIXELS = 10000
 # sampling step in a reference's depth map to measure its overlap
@@ -68,7 +80,8 @@ class IcpOptions(Options):
         default=(0.3, 0.15, 0.075),
         min_length=1,
         description="largest distance between corresponding points, metres, one per voxel size; "
-        "the last defines the overlap: the share of the query's points that close to the map",
+        "the first is the largest accepted movement of the camera; the last defines the overlap: "
+        "the share of the query's points that close to the map",
     )
     depth: DepthCloudOptions = Field(
         default_factory=DepthCloudOptions, description="limits of trusted depths"
@@ -78,41 +91,10 @@ class IcpOptions(Options):
         description="a, b, c of the depth noise a + b z + c z^2 at depth z, metres; weights the "
         "query's pixels",
     )
-    max_references: int = Field(
-        default=10,
-        gt=0,
-        description="largest number of map images with depth: those that overlap most, without "
-        "similar views",
-    )
     accept_always: bool = Field(
         default=False,
         description="accept refined poses without tests of overlap, residual and movement, unless "
         "the condition number is infinite",
-    )
-    min_points: int = Field(
-        default=1000,
-        ge=NORMAL_NEIGHBOURS,
-        description="smallest number of points in either cloud at the finest voxels",
-    )
-    min_overlap: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="smallest share of the query's points close to the map: within the first of "
-        "max_distances_m before refinement, within the last after it",
-    )
-    max_moved_m: float = Field(
-        default=0.3, gt=0, description="largest accepted movement of the centre, metres"
-    )
-    max_moved_deg: float = Field(
-        default=10.0, gt=0, description="largest accepted rotation, degrees"
-    )
-    max_condition: float = Field(
-        default=100.0,
-        gt=1,
-        description="largest condition number of the normal matrix at the coarsest level; above "
-        "it the surfaces do not determine the pose: a bare wall has 10000, a corridor "
-        "2000, a furnished room 15",
     )
 
     @model_validator(mode="after")
@@ -156,10 +138,10 @@ def refine_by_icp(
     local_from_cam = RigidTransform(cam_from_world.inverse().quat_wxyz, (0.0, 0.0, 0.0))
     fine_points = downsample(query_points, options.voxels_m[-1])
     fine_map = downsample(map_points - center, options.voxels_m[-1])
-    if len(fine_points) < options.min_points:
+    if len(fine_points) < _MIN_POINTS:
         reason = f"the query's depth has only {len(fine_points)} points"
         return PoseRefinement(cam_from_world, reason)
-    if len(fine_map) < options.min_points:
+    if len(fine_map) < _MIN_POINTS:
         return PoseRefinement(cam_from_world, f"the map has only {len(fine_map)} points here")
     coarser = zip(options.voxels_m[:-1], options.max_distances_m[:-1], strict=True)
     levels = [
@@ -207,10 +189,10 @@ def _reason_to_skip(
             f"{spacing:.3f} m, at most {limit:g} m is allowed"
         )
     reach = levels[0].fit(local_from_cam, options).reach
-    if reach < options.min_overlap:
+    if reach < _MIN_OVERLAP:
         return (
             f"{100 * reach:.0f} % of the query's points are within {options.max_distances_m[0]:g} "
-            f"m of the map, at least {100 * options.min_overlap:g} % must be"
+            f"m of the map, at least {100 * _MIN_OVERLAP:g} % must be"
         )
     return ""
 
@@ -243,13 +225,11 @@ def _reason_too_far(start: RigidTransform, end: RigidTransform, options: IcpOpti
     if options.accept_always:
         return ""
     moved_m, moved_deg = _movement(start, end)
-    if moved_m > options.max_moved_m:
-        return f"the pose moved by {moved_m:.3f} m, at most {options.max_moved_m:g} m is allowed"
-    if moved_deg > options.max_moved_deg:
-        return (
-            f"the pose rotated by {moved_deg:.2f} deg, at most {options.max_moved_deg:g} deg "
-            "is allowed"
-        )
+    limit_m = options.max_distances_m[0]
+    if moved_m > limit_m:
+        return f"the pose moved by {moved_m:.3f} m, at most {limit_m:g} m is allowed"
+    if moved_deg > _MAX_MOVED_DEG:
+        return f"the pose rotated by {moved_deg:.2f} deg, at most {_MAX_MOVED_DEG:g} deg is allowed"
     return ""
 
 
@@ -258,15 +238,15 @@ def _reason_to_refuse(
 ) -> str:
     if options.accept_always and math.isfinite(condition):
         return ""
-    if after.overlap < options.min_overlap:
+    if after.overlap < _MIN_OVERLAP:
         return (
             f"{100 * after.overlap:.0f} % of the query's points are on the map, "
-            f"at least {100 * options.min_overlap:g} % must be"
+            f"at least {100 * _MIN_OVERLAP:g} % must be"
         )
-    if condition > options.max_condition:
+    if condition > _MAX_CONDITION:
         return (
             f"the surfaces do not determine the pose: condition number {condition:.0f}, "
-            f"at most {options.max_condition:g} is allowed"
+            f"at most {_MAX_CONDITION:g} is allowed"
         )
     # the overlap varies with the voxel grid: tolerate two binomial standard deviations
     noise = 2 * math.sqrt(before.overlap * (1 - before.overlap) / num_points)
@@ -306,7 +286,7 @@ def map_cloud(
         observed = [scene.map_points(name) for name in references]
         return cropped(np.unique(np.concatenate([np.zeros((0, 3)), *observed]), axis=0))
     clouds, voxel_m = [np.zeros((0, 3))], options.voxels_m[-1]
-    for name in _different_views(overlaps, scene, options.max_references):
+    for name in _different_views(overlaps, scene):
         view = scene.map_depth(name)
         assert view is not None
         step_px = max(1, round(0.5 * voxel_m * focal_px(view.camera) / options.depth.max_depth_m))
@@ -342,13 +322,11 @@ def _overlaps(
     return sorted(shares, key=lambda each: -each[1])
 
 
-def _different_views(
-    overlaps: Sequence[tuple[str, float]], scene: RankingScene, count: int
-) -> list[str]:
+def _different_views(overlaps: Sequence[tuple[str, float]], scene: RankingScene) -> list[str]:
     names: list[str] = []
     quats, centers = np.zeros((0, 4)), np.zeros((0, 3))
     for name, overlap in overlaps:
-        if overlap <= 0 or len(names) == count:
+        if overlap <= 0 or len(names) == _MAX_REFERENCES:
             break
         pose = scene.map_pose(name)
         quat, center = np.array(pose.quat_wxyz), pose.center()

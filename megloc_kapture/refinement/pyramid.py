@@ -159,7 +159,7 @@ def build_pyramid(
     image: NDArray[np.uint8],
     mask: NDArray[np.bool_] | None = None,
     *,
-    levels: int = 5,
+    levels: int = 3,
     max_side_px: int = 640,
     appearance: Appearance = "normalised",
 ) -> list[Level]:

@@ -104,7 +104,6 @@ def pyramid_of(view: PosedImage, options: RenderingOptions) -> list[Level]:
     return build_pyramid(
         image,
         view.mask,
-        levels=options.levels,
         max_side_px=options.max_side_px,
         appearance=options.appearance,
     )

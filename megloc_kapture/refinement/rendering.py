@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from megloc_kapture.geometry.warping import PosedImage, image_with_depth
 from megloc_kapture.plugins import PoseRefinement, RankingScene
 from megloc_kapture.refinement.acceptance import (
+    MIN_CORRELATION,
     Candidate,
     RenderingOptions,
     accept_or_keep,
@@ -40,10 +41,13 @@ from megloc_kapture.refinement.references import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _MAX_STARTS, _START_POINTS = 5, 2500
+# smallest share of the query that the references must cover
+_MIN_OVERLAP = 0.2
 # alignment ends with a step this small, in pixels of the level: finest level, other levels
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
 # pixels of a query level per point of each reference; smallest number of points
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
+_MAX_POINTS = 12000  # of each reference, per level
 # if alignment from perturbed poses decreases the cost by at least this many standard errors,
 # alignment from the unperturbed pose is skipped
 _CLEAR = 4.0
@@ -60,7 +64,7 @@ class RenderingRefinement:
     def __init__(
         self, query: PosedImage, references: Sequence[PosedImage], options: RenderingOptions
     ) -> None:
-        self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
+        self.options = options
         self.camera, self.start = query.camera, query.cam_from_world
         self.query_levels = pyramid_of(query, options)
         self.levels = [pyramid_of(each, options) for each in references]
@@ -69,7 +73,7 @@ class RenderingRefinement:
     def refine(self) -> PoseRefinement:
         start = self.start
         seen, overlap = self._visibility(start)
-        if overlap < self.least_overlap:
+        if overlap < _MIN_OVERLAP:
             return _uncovered(start, overlap)
         coarsest = min([len(self.query_levels), *map(len, self.levels)]) - 1
         searched = self._decide(overlap, self._align_from_search(coarsest, start, seen))
@@ -90,7 +94,7 @@ class RenderingRefinement:
         ``judged`` bool (H, W) are the pixels over which the poses are compared, by default all.
         """
         seen, overlap = self._visibility(pose)
-        if overlap < self.least_overlap:
+        if overlap < _MIN_OVERLAP:
             return _uncovered(self.start, overlap)
         candidate = self._align(0, pose, seen)
         if candidate is not None and judged is not None:
@@ -136,7 +140,7 @@ class RenderingRefinement:
         level = self.query_levels[number]
         levels = [pyramid[number] for pyramid in self.levels]
         count = max(_COARSE_POINTS, level.valid.size // _PX_PER_POINT)
-        chosen = choose_points(self.points, levels, seen, min(self.options.max_points, count))
+        chosen = choose_points(self.points, levels, seen, min(_MAX_POINTS, count))
         return LevelProblem(chosen, level, self.camera, pose)
 
     def _best_perturbation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
@@ -193,7 +197,7 @@ class Rendering:
         if "squared_distance" not in measures or (
             measures["moved_m"] > options.max_translation_m
             or measures["turned_deg"] > options.max_rotation_deg
-            or measures["correlation_after"] < options.min_correlation
+            or measures["correlation_after"] < MIN_CORRELATION
         ):
             return None
         return dict(measures)

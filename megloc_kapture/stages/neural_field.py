@@ -346,7 +346,6 @@ class FieldRefiner:
         options = RenderingOptions(
             appearance="colours",
             max_side_px=side,
-            levels=1,
             max_translation_m=self.options.max_translation_m,
             max_rotation_deg=self.options.max_rotation_deg,
         )

@@ -26,7 +26,7 @@ COLOUR = Camera("PINHOLE", 640, 480, (525.0, 525.0, 320.0, 240.0))
 DEPTH = Camera("PINHOLE", 240, 180, (219.0, 219.0, 120.0, 90.0))
 IDENTITY = RigidTransform.identity()
 WALL_CAMERA = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
-WALL_OPTIONS = IcpOptions(max_references=2, voxels_m=(0.05,), max_distances_m=(0.3,))
+WALL_OPTIONS = IcpOptions(voxels_m=(0.05,), max_distances_m=(0.3,))
 WALL_QUERY = DepthView(WALL_CAMERA, np.full((48, 64), 2.0, np.float32), IDENTITY)
 OFFSET = rigid(np.radians([0.5, -1.5, 0.3]), [-0.06, 0.004, 0.01])
 
@@ -129,17 +129,24 @@ def test_a_world_far_from_its_origin(furnished: Scene) -> None:
     assert distance_m < 0.005 and angle_deg < 0.2
 
 
-def test_movement_and_overlap_are_bounded(furnished: Scene) -> None:
+def test_movement_and_overlap_are_bounded(
+    furnished: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     start = displaced(QUERY, 0, 0.05, 3.0)
-    assert "moved" in refine(furnished, start, IcpOptions(max_moved_m=0.04)).reason
-    forced = refine(furnished, start, IcpOptions(max_moved_m=0.04, accept_always=True))
-    assert forced.accepted and forced.cam_from_world != start
-    assert "rotated" in refine(furnished, start, IcpOptions(max_moved_deg=2.5)).reason
-    uncovered = refine(furnished, start, IcpOptions(min_overlap=1.0))
-    assert "of the query's points are on the map" in uncovered.reason
+    with monkeypatch.context() as patch:
+        patch.setattr(icp, "_MAX_MOVED_DEG", 2.5)
+        assert "rotated" in refine(furnished, start).reason
+        forced = refine(furnished, start, IcpOptions(accept_always=True))
+        assert forced.accepted and forced.cam_from_world != start
+    with monkeypatch.context() as patch:
+        patch.setattr(icp, "_MIN_OVERLAP", 1.0)
+        assert "of the query's points are on the map" in refine(furnished, start).reason
     # the true pose does not get worse
     distance_m, angle_deg = pose_errors(refine(furnished, QUERY).cam_from_world, QUERY)
     assert distance_m < 0.003 and angle_deg < 0.1
+    # a camera may move as far as its points may be from the map's
+    assert icp._reason_too_far(shifted(0.0), shifted(0.29), IcpOptions()) == ""
+    assert "moved by 0.310 m" in icp._reason_too_far(shifted(0.0), shifted(0.31), IcpOptions())
 
 
 def test_the_overlap_may_fall_by_its_noise() -> None:

@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.poses import perturbed
 from megloc_kapture.plugins import PoseRefinement
+from megloc_kapture.refinement import acceptance
 from megloc_kapture.refinement.acceptance import (
     Candidate,
     RenderingOptions,
@@ -222,7 +223,7 @@ def test_the_covariance_predicts_errors_and_noise_is_not_significant() -> None:
     assert 0.6 < np.mean(significance) < 1.8
 
 
-def test_poses_beyond_a_bound_are_rejected() -> None:
+def test_poses_beyond_a_bound_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     aligned, truth = problem(count=3000, noise=0.3)
     start = displaced(truth, 0)
     candidate = Candidate(aligned, aligned, aligned.nuisance_at(truth))
@@ -235,11 +236,16 @@ def test_poses_beyond_a_bound_are_rejected() -> None:
     for options, reason in (
         ({"max_translation_m": 0.05}, "would move"),
         ({"max_rotation_deg": 1.0}, "would turn"),
-        ({"min_correlation": 0.99}, "correlation"),
-        ({"min_significance": 1000.0}, "standard errors"),
     ):
         refused = result(**options)
         assert reason in refused.reason and refused.cam_from_world is start
+    for name, bound, reason in (
+        ("MIN_CORRELATION", 0.99, "correlation"),
+        ("_MIN_SIGNIFICANCE", 1000.0, "standard errors"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(acceptance, name, bound)
+            assert reason in result().reason and result().cam_from_world is start
     # the overlap may fall by a tenth
     assert result(overlap=0.82).accepted and "overlap falls" in result(overlap=0.8).reason
     assert result(overlap=0.0, accept_always=True).accepted

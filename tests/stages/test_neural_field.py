@@ -120,7 +120,7 @@ def test_appearance_and_acceptance_use_different_halves_of_the_image(
     assert judged and all((one == ~half).all() for one in judged)
     assert whole.accepted and half.mean() == pytest.approx(0.5, abs=0.05)
     reference = PosedImage(image, LARGER, truth, DepthView(LARGER, depth, IDENTITY))
-    options = RenderingOptions(levels=1)
+    options = RenderingOptions()
     noise = np.random.default_rng(0).integers(0, 255, image.shape, np.uint8)
     query = PosedImage(np.where(half[..., None], noise, image), LARGER, start)
     by_one, by_other, by_all = (
