@@ -10,19 +10,35 @@ from typing import Annotated, Literal
 
 import tyro
 
-from megloc_kapture.cli.common import (
-    Common,
-    Force,
-    Input,
-    Inputs,
-    Output,
-    Overwrite,
-    existing,
+from megloc_kapture.cli.common import Common, Force, Input, Inputs, Output, Overwrite
+from megloc_kapture.errors import check_option, require
+from megloc_kapture.evaluation.check import check_submission, read_reference
+from megloc_kapture.evaluation.comparison import compare
+from megloc_kapture.evaluation.evaluate import (
+    benchmark_beside,
+    evaluate_results,
+    results_without_truth,
 )
-from megloc_kapture.errors import OptionError, check_option, require
-from megloc_kapture.io.output_folders import staged_output
-
-EVALUATION = "evaluation"
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.pose_files import provenance_path
+from megloc_kapture.evaluation.report.reports import report_text, write_report
+from megloc_kapture.evaluation.scoring import Reported
+from megloc_kapture.io.dataset_tables import (
+    PROTOCOL_FILE,
+    SIDE_TABLES,
+    Protocol,
+    check_tables,
+    read_protocol,
+    tables_of,
+)
+from megloc_kapture.io.output_folders import check_claim, check_new_file, staged_output
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known, dataset_names
+from megloc_kapture.pipeline.submission import (
+    check_dataset,
+    workspace_provenance,
+    write_submission,
+)
+from megloc_kapture.stages.stage import EVALUATION
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,18 +69,10 @@ class Evaluate(Common):
     force: Force = False
 
     def run(self) -> None:
-        # slow import
-        from megloc_kapture.evaluation.comparison import compare
-        from megloc_kapture.evaluation.evaluate import (
-            benchmark_beside,
-            evaluate_results,
-            results_without_truth,
-        )
-        from megloc_kapture.evaluation.metrics import Threshold
-        from megloc_kapture.evaluation.report.reports import report_text, write_report
-        from megloc_kapture.evaluation.scoring import Reported
-
-        self._check()
+        check_option(self.input, "no result given; use -i")
+        resolved = [path.resolve() for path in self.input]
+        twice = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
+        check_option(twice is None, f"{twice} is given twice")
         benchmark = benchmark_beside(
             [self.gt, *self.input], side_tables=self.side_tables, dataset=self.dataset
         )
@@ -89,14 +97,6 @@ class Evaluate(Common):
                 write_report(out, reported)
         print(report_text(reported))
 
-    def _check(self) -> None:
-        check_option(self.input, "no result given; use -i")
-        resolved = [path.resolve() for path in self.input]
-        twice = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
-        check_option(twice is None, f"{twice} is given twice")
-        check_option(self.align == "none" or self.gt is not None, "--align needs true poses (--gt)")
-        existing([] if self.map is None else [self.map])
-
 
 @dataclass(frozen=True, kw_only=True)
 class Submit(Common):
@@ -118,24 +118,16 @@ class Submit(Common):
     """Overwrite the pose file and its JSON file."""
 
     def run(self) -> None:
-        from megloc_kapture.io.dataset_tables import (
-            Protocol,
-            check_tables,
-            read_protocol,
-            tables_of,
-        )
-        from megloc_kapture.pipeline.submission import (
-            check_dataset,
-            workspace_provenance,
-            write_submission,
-        )
-
         if self.side_tables is not None:
             check_tables(self.side_tables)
         tables = self.side_tables or tables_of(self.input)
         rules = Protocol() if tables is None else read_protocol(tables)
         check_dataset(self.dataset, rules, tables=tables)
-        self._check_output(folder=rules.pose_file == "mlad")
+        if rules.pose_file == "mlad":
+            check_claim(self.output, kind="submission", force=self.force)
+        else:
+            check_new_file(self.output, force=self.force)
+        check_new_file(provenance_path(self.output), force=self.force)
         counts = write_submission(
             self.input,
             self.output,
@@ -144,19 +136,6 @@ class Submit(Common):
             from_rig=self.from_rig,
         )
         print(f"{summary(counts)}: {self.output}")
-
-    def _check_output(self, *, folder: bool) -> None:
-        from megloc_kapture.evaluation.pose_files import provenance_path
-
-        place = self.output
-        if place.is_dir() != folder and place.exists():
-            kind = "folder of one file per relocalization file" if folder else "file"
-            raise OptionError(f"{place} exists and is not a {kind}")
-        empty = folder and place.exists() and not any(place.iterdir())
-        paths = [provenance_path(place)] if empty else [place, provenance_path(place)]
-        existing = [path for path in paths if path.exists()]
-        if existing and not self.force:
-            raise OptionError(f"{existing[0]} exists; -f overwrites it")
 
 
 def summary(counts: Mapping[str, int]) -> str:
@@ -194,11 +173,6 @@ class Check(Common):
 
     def run(self) -> int:
         """Return 2 if there are problems."""
-        from megloc_kapture.evaluation.check import check_submission, read_reference
-        from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
-        from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known
-        from megloc_kapture.pipeline.submission import check_dataset
-
         check_known(self.dataset)
         require(self.file.exists(), "no such file", path=self.file)
         data = self.data or self._workspace()
@@ -218,8 +192,6 @@ class Check(Common):
         return PROBLEMS_FOUND if report.has_problems else 0
 
     def _workspace(self) -> Path | None:
-        from megloc_kapture.pipeline.datasets import dataset_names
-
         # runs/synthetic-aachen-classic, for example, is not a workspace of the dataset synthetic
         longer = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
         workspaces = [

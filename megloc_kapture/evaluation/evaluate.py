@@ -97,7 +97,6 @@ def evaluate(
     align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
     """
     check_option(align in get_args(Align), f"align is {align!r}; give none, se3 or sim3")
-    require(mapping is None or Path(mapping).is_dir(), "no such folder", path=mapping)
     benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
     given = () if thresholds is None else thresholds
@@ -284,6 +283,7 @@ def _in_local_frame(
 
 
 def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
+    require(mapping is None or Path(mapping).is_dir(), "no such folder", path=mapping)
     if not isinstance(source, Mapping):
         return context_of(source, mapping=mapping)
     poses = {image: pose for image, pose in source.items() if isinstance(pose, Pose)}

@@ -134,6 +134,7 @@ def test_results_without_truth_are_compared_with_each_other(
         ("-i {}/a/localized -i {}/a/../a/localized", "is given twice"),
         ("-i {}/a/localized --dataset cmu", "unknown dataset 'cmu'; known: aachen"),
         ("-i {}/a/localized --gt {}/a/query_gt --thresholds x", "METRES,DEGREES"),
+        ("-i {}/a/localized --gt {}/a/query_gt --map {}/none", "none: no such folder"),
         ("-i {}/a/localized --gt {}/a/query_gt -o {}/a", "is not empty"),
     ],
 )
@@ -167,7 +168,7 @@ def test_a_submission_of_relocalization_pairs_is_a_folder(megloc: Any, tmp_path:
     assert done.out == f"3 poses of 4 queries, 1 missing, written as dummy poses: {place}\n"
     assert {path.name for path in tmp_path.glob("submission*")} == {place.name, "submission.json"}
     assert [path.name for path in place.iterdir()] == ["a_to_b.txt"]
-    megloc(*command).refused("exists; -f")
+    megloc(*command).refused("submission: is not empty .* or -f")
     assert megloc(*command, "-f").status == 0
     tables = ("--side-tables", root / "megloc")
     megloc("evaluate", "-i", place, *tables).refused("relative to the map's", "--map")

@@ -106,7 +106,7 @@ def test_the_map_of_single_stages_is_localized_in_evaluated_and_submitted(
     # the pose file gives the same recall as the folder
     again = megloc("evaluate", "-i", poses, "--gt", scene / "query_gt")
     assert "100.0 / 100.0 / 100.0 / 100.0" in again.out
-    megloc("submit", "kapture", "-i", result, "-o", poses).refused(r"poses\.txt exists; -f")
+    megloc("submit", "kapture", "-i", result, "-o", poses).refused(r"poses\.txt: exists; -f")
     assert megloc("submit", "kapture", "-i", result, "-o", poses, "-f").status == 0
 
 
