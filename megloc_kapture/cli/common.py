@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import timedelta
@@ -57,13 +57,6 @@ Texts = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 Item = TypeVar("Item")
 
 _LINE_EVERY_S = 10.0
-
-
-def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
-    for folder in folders:
-        reason = "is a file; a folder is needed" if folder.is_file() else "no such folder"
-        require(folder.is_dir(), reason, path=folder)
-    return tuple(folders)
 
 
 def kapture_map(path: Path) -> KaptureFolder:
@@ -214,12 +207,10 @@ class Reading:
     features_dir: Folders = ()
     """Folder with features outside the kapture folders; may be repeated."""
 
-    @property
-    def features_dirs(self) -> tuple[Path, ...]:
-        return existing(self.features_dir)
-
     def kapture(self, root: Path) -> KaptureFolder:
-        folder = KaptureFolder(root, features_dirs=self.features_dirs)
+        for place in self.features_dir:
+            require(place.is_dir(), "no such folder of features", path=place)
+        folder = KaptureFolder(root, features_dirs=self.features_dir)
         folder.read()  # names a COLMAP model or photographs, before features are missed
         return folder
 
@@ -235,7 +226,7 @@ class Reading:
         return KaptureMap.open(
             path,
             keypoints_types=keypoints_types,
-            features_dirs=self.features_dirs,
+            features_dirs=self.features_dir,
             pixel_origin=pixel_origin,
         )
 

@@ -23,7 +23,6 @@ from megloc_kapture.cli.common import (
     Texts,
     cameras_of_text,
 )
-from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.files import read_text
@@ -76,7 +75,8 @@ class Localize(Reading, Deciding, Common):
     """Write into a non-empty folder, and localize in an inconsistent map."""
 
     def run(self) -> None:
-        self._check_queries()
+        if (self.query is None) == (not self.images):
+            raise OptionError("give either --query (a kapture folder) or --images")
         workers = available_cores() if self.workers is None else self.workers
         folder: KaptureFolder | Photographs
         if self.query is None:
@@ -131,21 +131,6 @@ class Localize(Reading, Deciding, Common):
         )
         if counts["queries"] and not counts["localized"]:
             self.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
-
-    def _check_queries(self) -> None:
-        if (self.query is None) == (not self.images):
-            raise OptionError("give either --query (a kapture folder) or --images")
-        check_option(
-            self.query is None or (self.camera is None and self.every is None),
-            "--camera and --every are for --images; a kapture folder has cameras",
-        )
-        check_option(
-            self.query is None or not self.query.is_file(),
-            f"--query {self.query}: not a kapture folder; a list of cameras goes to "
-            "--camera, the images to --images",
-        )
-        for path in self.images:
-            check_option(not is_kapture(path), f"--images {path}: a kapture folder; use --query")
 
 
 @dataclass(frozen=True, kw_only=True)

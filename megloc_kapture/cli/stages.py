@@ -26,7 +26,6 @@ from megloc_kapture.cli.common import (
     Reading,
     Texts,
     Working,
-    existing,
     kapture_map,
 )
 from megloc_kapture.errors import OptionError, check_option, require
@@ -275,8 +274,6 @@ class PairsMapping(Reading, Choosing, Working):
         chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
         covisible = self.covisibility_map
-        if covisible is not None and not options.needs_points():
-            raise OptionError("--covisibility-map is for --by covisibility")
         retrieval = None
         if "retrieval" in self.by:
             retrieval = _retrieval(mapping, self.features, self.fusion, chosen)
@@ -452,7 +449,7 @@ class Preprocess(Computing, Working):
     def run(self) -> None:
         options = self.options()
         source = kapture_map(self.input)
-        sequences = [KaptureFolder(path) for path in existing(self.sequence)]
+        sequences = [KaptureFolder(path) for path in self.sequence]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             counts = preprocess_images(source, out, options, sequences=sequences, work=work)
             keep_unit(source.root, out)
