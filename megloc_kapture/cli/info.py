@@ -35,25 +35,15 @@ from megloc_kapture.pipeline.presets import (
     options_of_preset,
 )
 from megloc_kapture.plugin_loading import load_plugin, plugin_class, plugin_names
-from megloc_kapture.plugins import (
-    DATASETS,
-    DEPTH_ESTIMATORS,
-    GLOBAL_FEATURES,
-    IMAGE_DISTANCES,
-    LOCAL_FEATURES,
-    MATCHERS,
-    POSE_RANKERS,
-    POSE_REFINERS,
-    SEGMENTERS,
-    STAGES,
-    PluginChoice,
-)
+from megloc_kapture.plugins import LOCAL_FEATURES, PROTOCOLS, RENDERED_DATASETS, PluginChoice
 from megloc_kapture.stages.global_features import VLAD
 from megloc_kapture.stages.scene import depth_records
 from megloc_kapture.values import Options
 
 _COLUMN = 18
 _QUANTILES = (0.1, 0.5, 0.9)
+# twins have the names of their datasets
+_GROUPS = PROTOCOLS.keys() - {RENDERED_DATASETS}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,18 +213,20 @@ class OptionsCommand(Common):
 
     def run(self) -> None:
         every = list(options_of(options_of_preset(self.preset)))
-        selected = [option for option in every if _is_below(option[0], self.key)]
+        selected = [
+            option for option in every if not self.key or f"{option[0]}.".startswith(f"{self.key}.")
+        ]
         if self.basic and not self.key:
             selected = [option for option in selected if option[0] in BASIC_OPTIONS]
-        if not selected:
-            selected = list(_options_of_plugins(self.key))
-            if not selected and self.key in _plugins():
+        plugins = {VLAD, *(name for group in _GROUPS for name in plugin_names(group))}
+        if not selected and self.key in plugins:
+            selected = list(_options_of_plugin(self.key))
+            if not selected:
                 print(f"{self.key} has no options")
-                return
-        if not selected:
+        elif not selected:
             keys = [key for key, _, _ in every]
             steps = {key.rpartition(".")[0] for key in keys} - {""}
-            known = sorted({*keys, *steps, *_plugins()})
+            known = sorted({*keys, *steps, *plugins})
             near = get_close_matches(self.key, known, n=3)
             hint = f"did you mean {' or '.join(near)}? " if near else ""
             raise OptionError(
@@ -274,26 +266,8 @@ def _type_name(annotation: Any) -> str:
     return re.sub(r"Literal\[(.*?)\]", lambda m: m[1].replace("', '", "' | '"), text)
 
 
-def _is_below(key: str, asked: str) -> bool:
-    return not asked or key == asked or key.startswith(f"{asked}.")
-
-
-def _plugins() -> dict[str, list[str]]:
-    """Return plugin name -> groups in which it is registered."""
-    groups_of: dict[str, list[str]] = {VLAD: []}
-    for group in (
-        *(LOCAL_FEATURES, GLOBAL_FEATURES, MATCHERS, POSE_RANKERS, POSE_REFINERS),
-        *(SEGMENTERS, DEPTH_ESTIMATORS, IMAGE_DISTANCES, DATASETS, STAGES),
-    ):
-        for name in plugin_names(group):
-            groups_of.setdefault(name, []).append(group)
-    return groups_of
-
-
-def _options_of_plugins(name: str) -> Iterator[tuple[str, Any, FieldInfo]]:
-    if name == VLAD:
-        yield from options_of(VladOptions(), f"{name}: options.")
-    for group in _plugins().get(name, ()):
-        model = getattr(plugin_class(group, name), "Options", None)
-        if model is not None:
-            yield from options_of(model(), f"{name}: options.")
+def _options_of_plugin(name: str) -> Iterator[tuple[str, Any, FieldInfo]]:
+    groups = [group for group in _GROUPS if name in plugin_names(group)]
+    models = [getattr(plugin_class(group, name), "Options", None) for group in groups]
+    for model in [VladOptions] if name == VLAD else filter(None, models):
+        yield from options_of(model(), f"{name}: options.")
