@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from megloc_kapture.cli.common import (
@@ -23,10 +23,14 @@ from megloc_kapture.cli.common import (
     kapture_map,
 )
 from megloc_kapture.errors import DataError, OptionError, check_option, require
-from megloc_kapture.io.images import WRITABLE_SUFFIXES
+from megloc_kapture.io.files import remove
+from megloc_kapture.io.images import WRITABLE_SUFFIXES, write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.io.output_folders import check_new_file, claim_folder, release_folder
+from megloc_kapture.io.text_lines import numbers_of
 from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.pipeline.presets import options_with
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
 
@@ -60,9 +64,7 @@ class Train(Common):
     """Overwrite the files of another training."""
 
     def run(self) -> None:
-        # slow import
-        from megloc_kapture.pipeline.presets import options_with
-        from megloc_kapture.training.train import TASKS, train
+        from megloc_kapture.training.train import TASKS, train  # loads torch
 
         changes = {} if self.features is None else {"features.name": self.features}
         options = options_with(TASKS[self.task], self.set, changes)
@@ -122,20 +124,13 @@ class TrainField(Common):
     """Write into a non-empty folder; start the training again."""
 
     def run(self) -> None:
-        from pydantic import ValidationError
-
-        from megloc_kapture.io.files import first_problem, remove
-        from megloc_kapture.io.output_folders import claim_folder, release_folder
+        # these load torch
         from megloc_kapture.refinement.field_training import FieldTrainingOptions
         from megloc_kapture.stages.neural_field import STATE_FILE, train_field_of_map
 
         of_same_name = vars(self).keys() & FieldTrainingOptions.model_fields
-        try:
-            options = FieldTrainingOptions(
-                max_side_px=self.max_side, **{name: vars(self)[name] for name in of_same_name}
-            )
-        except ValidationError as error:
-            raise OptionError(first_problem(error)) from error
+        changes = {"max_side_px": self.max_side} | {name: vars(self)[name] for name in of_same_name}
+        options = options_with(FieldTrainingOptions, changes)
 
         def progress(step: int, seconds: float, psnr_db: list[float]) -> None:
             held_out = ", ".join(f"{value:.1f}" for value in psnr_db)
@@ -189,7 +184,7 @@ class Render(Working):
     """Overwrite a file, or write into a non-empty folder."""
 
     def run(self) -> None:
-        from megloc_kapture.stages.neural_field import render_along, views_between
+        from megloc_kapture.stages.neural_field import render_along, views_between  # load torch
 
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
             raise OptionError("give one of --pose (with --camera), --along and --between")
@@ -215,21 +210,14 @@ class Render(Working):
         print(f"{count} views rendered: {self.output}")
 
     def _render_one(self) -> None:
-        import cv2
-        import numpy as np
-
-        from megloc_kapture.io.files import write_bytes
-        from megloc_kapture.io.images import write_image
-        from megloc_kapture.io.output_folders import check_new_file
         from megloc_kapture.stages.neural_field import open_field
 
         if self.pose is None or self.camera is None:
             raise OptionError("--pose needs --camera")
         pose, camera = _pose_of_text(self.pose), camera_of_text(self.camera)
-        endings: list[tuple[Path, tuple[str, ...]]] = [(self.output, WRITABLE_SUFFIXES)]
-        if self.depth is not None:
-            endings.append((self.depth, (".png",)))
-        for path, known in endings:
+        for path, known in ((self.output, WRITABLE_SUFFIXES), (self.depth, (".png",))):
+            if path is None:
+                continue
             check_option(
                 path.suffix.lower() in known, f"{path}: the file must end in {' or '.join(known)}"
             )
@@ -241,17 +229,13 @@ class Render(Working):
         write_image(self.output, rendered.image)
         if self.depth is not None:
             stored = np.clip(np.round(depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
-            write_bytes(self.depth, cv2.imencode(".png", stored)[1].tobytes())
+            write_image(self.depth, stored)
 
 
 def _pose_of_text(text: str) -> RigidTransform:
     """Parse ``cam_from_world`` as ``qw,qx,qy,qz,tx,ty,tz``."""
     try:
-        w, x, y, z, *translation = map(float, text.split(","))
-        quat = unit_quaternion((w, x, y, z))
-        tx, ty, tz = translation
-        if not all(map(math.isfinite, translation)):
-            raise ValueError
-    except (ValueError, DataError):
+        w, x, y, z, tx, ty, tz = numbers_of(text.split(","), "qw qx qy qz tx ty tz")
+        return RigidTransform(unit_quaternion((w, x, y, z)), (tx, ty, tz))
+    except DataError:
         raise OptionError(f"--pose {text}: give qw,qx,qy,qz,tx,ty,tz") from None
-    return RigidTransform(quat, (tx, ty, tz))

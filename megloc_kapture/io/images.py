@@ -136,11 +136,11 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         yield image
 
 
-def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int = 95) -> None:
+def write_image(path: Path | str, image: NDArray[Any], *, jpeg_quality: int = 95) -> None:
     """Write uint8 (H, W, 3) RGB or (H, W) grey in the format of the suffix, atomically.
 
-    The bytes are deterministic. A suffix that is not in WRITABLE_SUFFIXES gives PNG if it denotes a
-    lossless format, else JPEG.
+    PNG also takes uint16. The bytes are deterministic. A suffix that is not in WRITABLE_SUFFIXES
+    gives PNG if it denotes a lossless format, else JPEG.
     """
     path = Path(path)
     write_bytes(path, _encoded(path, image, jpeg_quality))
@@ -166,7 +166,7 @@ def _format_suffix(name: str) -> str:
     return ".png" if suffix in _LOSSLESS else ".jpg"
 
 
-def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
+def _encoded(path: Path, image: NDArray[Any], jpeg_quality: int) -> bytes:
     import cv2
 
     suffix = _format_suffix(path.name)
