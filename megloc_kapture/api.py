@@ -25,6 +25,7 @@ from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import (
     VIDEO_SUFFIXES,
+    Photo,
     guessed_camera,
     image_size,
     photo_of,
@@ -203,30 +204,24 @@ def _query_of(
     camera: Camera | None,
     prior: Sequence[str] | None,
 ) -> Query:
-    name, orientation = "query", 1
     check_image(image)
+    name = image.name if isinstance(image, Path) else "query"  # as in a list or a folder
     if camera is not None:
         check_camera(camera)
         if isinstance(image, np.ndarray):
             size = image.shape[1], image.shape[0]
         else:
             size = image_size(image) if isinstance(image, Path) else image.size
-        given, camera = camera, fitted_camera(camera, size)
+        photo = Photo(fitted_camera(camera, size))
         place = image if isinstance(image, Path) else Path(name)
-        warn_of_scaled(place, [(given, camera)] if camera != given else [])
-    if isinstance(image, Path):
-        name = image.name  # as in a list or a folder
-        if camera is None:
-            photo = read_photo(image)
-            camera, orientation = photo.upright_camera, photo.orientation
-    elif not isinstance(image, np.ndarray):
-        photo = photo_of(image)
-        image = pillow_pixels(image)
-        if camera is None:
-            camera, image = photo.upright_camera, turned_upright(image, photo.orientation)
-    elif camera is None:
-        camera = guessed_camera(image.shape[1], image.shape[0])
-    return Query(camera, image, name, prior=prior, orientation=orientation)
+        warn_of_scaled(place, [(camera, photo.camera)] if camera != photo.camera else [])
+    elif isinstance(image, np.ndarray):
+        photo = Photo(guessed_camera(image.shape[1], image.shape[0]))
+    else:
+        photo = read_photo(image) if isinstance(image, Path) else photo_of(image)
+    if not isinstance(image, Path | np.ndarray):
+        image = turned_upright(pillow_pixels(image), photo.orientation)
+    return Query(photo.upright_camera, image, name, prior=prior, orientation=photo.orientation)
 
 
 def open_map(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,18 +43,6 @@ Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 Precision = Literal["full", "half"]
 
 
-def _is_list(annotation: Any) -> bool:
-    """True for ``tuple[X, ...]``, also if it may be None."""
-    kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
-    return any(get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis for kind in kinds)
-
-
-def _may_be_none(annotation: Any) -> bool:
-    """True if None is a value of the type, and no choice is named ``none``."""
-    kinds = get_args(annotation)
-    return type(None) in kinds and not any("none" in get_args(kind) for kind in kinds)
-
-
 def listed(value: Any) -> Any:
     """Convert comma-separated names, or a single table, to a tuple."""
     if isinstance(value, str):
@@ -75,12 +63,17 @@ class Options(BaseModel):
             return values
         read: dict[str, Any] = {}
         for key, value in values.items():
-            field = cls.model_fields.get(key)
-            annotation = None if field is None else field.annotation
-            if isinstance(value, str) and value == "none" and _may_be_none(annotation):
+            annotation = cls.model_fields[key].annotation if key in cls.model_fields else None
+            is_union = get_origin(annotation) in (Union, UnionType)
+            kinds = get_args(annotation) if is_union else (annotation,)
+            # "none" may also be the name of a choice
+            may_be_none = type(None) in kinds and not any("none" in get_args(k) for k in kinds)
+            if isinstance(value, str) and value == "none" and may_be_none:
                 read[key] = None
+            elif any(get_origin(k) is tuple and get_args(k)[-1] is Ellipsis for k in kinds):
+                read[key] = listed(value)
             else:
-                read[key] = listed(value) if _is_list(annotation) else value
+                read[key] = value
         return read
 
 
