@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +90,8 @@ class Camera:
     focal_deviation : relative standard deviation of the focal length. 0 means that it is known and
         fixed; otherwise the focal length is estimated with the pose.
     """
+
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")  # for cameras in JSON
 
     model: str
     width: int

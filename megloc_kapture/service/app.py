@@ -17,7 +17,7 @@ from fastapi import Depends, FastAPI, Query, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, Response
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -27,7 +27,7 @@ from megloc_kapture.io.images import decode_image_rgb, photo_of, turned_upright
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query as ImageQuery
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 _PAGE = Path(__file__).with_name("localize.html")
 _PAGE_POLICY = (
@@ -42,7 +42,7 @@ _FORM = {
     "required": ["image"],
     "properties": {
         "image": {"type": "string", "format": "binary", "description": "JPEG or PNG"},
-        "camera": {"type": "string", "description": "a CameraModel as JSON"},
+        "camera": {"type": "string", "description": "a Camera as JSON"},
     },
 }
 _REQUEST_BODY = {
@@ -55,19 +55,6 @@ _REQUEST_BODY = {
 }
 
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-
-
-class CameraModel(BaseModel):
-    """Camera in COLMAP's convention; the centre of the first pixel is (0.5, 0.5)."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    model: str = Field(description=f"one of {', '.join(CAMERA_MODEL_NUM_PARAMS)}")
-    width: int = Field(ge=1, le=100_000, description="size of the image as stored, pixels")
-    height: int = Field(ge=1, le=100_000)
-    params: list[float] = Field(
-        max_length=12, description="in COLMAP's order; focal lengths and principal point in pixels"
-    )
 
 
 class Answer(BaseModel):
@@ -90,7 +77,7 @@ class Answer(BaseModel):
     candidates: list[str] = Field(description="matched map images, best first")
     remarks: list[str]
     frame: str | None = Field(description="the pose's coordinate frame, if the map has several")
-    camera: CameraModel = Field(
+    camera: Camera = Field(
         description="camera of the request; if omitted, the camera of the upright image, whose "
         "focal length is initialised from EXIF or a guess and estimated with the pose"
     )
@@ -102,7 +89,6 @@ class Answer(BaseModel):
         ``frame`` is the pose's coordinate frame, "" if the map has only one.
         """
         pose = result if isinstance(result, Pose) else None
-        used = camera if pose is None else pose.camera or camera
         covariance = None if pose is None else pose.covariance
         return cls(
             localized=pose is not None,
@@ -116,20 +102,17 @@ class Answer(BaseModel):
             candidates=list(result.candidates),
             remarks=list(result.remarks),
             frame=frame or None,
-            camera=CameraModel(
-                model=used.model, width=used.width, height=used.height, params=list(used.params)
-            ),
+            camera=camera if pose is None else pose.camera or camera,
         )
 
 
 def read_camera(text: str) -> Camera:
     try:
-        read = CameraModel.model_validate_json(text)
+        return TypeAdapter(Camera).validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         where = ".".join(["camera", *map(str, first["loc"][:2])])
         raise DataError(f"{where}: {first['msg']}") from error
-    return Camera(read.model, read.width, read.height, tuple(read.params))
 
 
 def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> ImageQuery:
@@ -292,7 +275,7 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
             str | None,
             Query(
                 max_length=2000,
-                description="a CameraModel as JSON; a form may have it as a field instead",
+                description="a Camera as JSON; a form may have it as a field instead",
             ),
         ] = None,
     ) -> Response:
