@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, make_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -407,10 +407,8 @@ class OutsideStage(Working):
 
 def stage_command(name: str) -> type[Any]:
     """Return the command of a registered stage."""
-    command = make_dataclass(name, [], bases=(OutsideStage,), frozen=True, kw_only=True)
-    command.stage = name  # type: ignore[attr-defined]
-    command.__doc__ = plugin_class(STAGES, name).__doc__ or f"Run the stage {name}."
-    return command
+    text = plugin_class(STAGES, name).__doc__ or f"Run the stage {name}."
+    return type(name, (OutsideStage,), {"stage": name, "__doc__": text})
 
 
 @dataclass(frozen=True, kw_only=True)
