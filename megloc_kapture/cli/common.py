@@ -218,16 +218,24 @@ class Reading:
         """Open the kapture folder of a map or workspace."""
         return self.kapture(kapture_map(root).root)
 
-    def open_map(
-        self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
-    ) -> KaptureMap:
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingMap(Reading):
+    """Flags of commands that localize in a kapture map."""
+
+    keypoints_type: Texts = ()
+    """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
+    pixel_origin: PixelOriginChoice = "auto"
+    """Pixel origin of the map's intrinsics; auto detects it."""
+
+    def open_map(self, path: Path) -> KaptureMap:
         from megloc_kapture.pipeline.kapture_map import KaptureMap
 
         return KaptureMap.open(
             path,
-            keypoints_types=keypoints_types,
+            keypoints_types=self.keypoints_type,
             features_dirs=self.features_dir,
-            pixel_origin=pixel_origin,
+            pixel_origin=self.pixel_origin,
         )
 
 

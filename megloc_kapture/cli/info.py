@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from pydantic.fields import FieldInfo
 
-from megloc_kapture.cli.common import Common, Reading
+from megloc_kapture.cli.common import Common, ReadingMap
 from megloc_kapture.cli.maps import report_lines
 from megloc_kapture.datasets.kapture_folders import cameras_of_folder
 from megloc_kapture.errors import DataError, MeglocError, OptionError
@@ -26,7 +26,7 @@ from megloc_kapture.io.kapture.folder import ARRAY_KINDS
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
-from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
+from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
 from megloc_kapture.pipeline.live_source import MapMatching
 from megloc_kapture.pipeline.presets import (
     BASIC_OPTIONS,
@@ -47,15 +47,11 @@ _GROUPS = PROTOCOLS.keys() - {RENDERED_DATASETS}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Info(Reading, Common):
+class Info(ReadingMap, Common):
     """Describe a kapture folder and its use as a map."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
     """Kapture folder, or a COLMAP model."""
-    keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Keypoints type; may be repeated; if omitted, all types with points."""
-    pixel_origin: PixelOriginChoice = "auto"
-    """Pixel origin of the map's intrinsics; auto detects it."""
     deep: bool = False
     """Also read all images and matches."""
 
@@ -78,7 +74,7 @@ class Info(Reading, Common):
 
     def _describe_map(self, root: Path) -> None:
         try:
-            opened = self.open_map(root, self.keypoints_type, self.pixel_origin)
+            opened = self.open_map(root)
         except DataError as error:
             line("localizing", f"not possible: {error}")
             return

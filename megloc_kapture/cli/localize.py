@@ -19,8 +19,7 @@ from megloc_kapture.cli.common import (
     Input,
     Output,
     Overwrite,
-    Reading,
-    Texts,
+    ReadingMap,
     cameras_of_text,
 )
 from megloc_kapture.errors import OptionError, check_option, require
@@ -31,7 +30,7 @@ from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.executors import available_cores
-from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
@@ -45,7 +44,7 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Localize(Reading, Deciding, Common):
+class Localize(ReadingMap, Deciding, Common):
     """Localize photographs, or the images of a kapture folder, in a kapture map."""
 
     input: Input
@@ -65,10 +64,6 @@ class Localize(Reading, Deciding, Common):
     """Kapture folder with the queries' poses, and status.csv."""
     pairs: Path | None = None
     """Pairs file with the candidates of each query, instead of retrieval."""
-    keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
-    pixel_origin: PixelOriginChoice = "auto"
-    """Pixel origin of the map's intrinsics; auto detects it."""
     workers: int | None = None
     """Number of threads; if omitted, all cores."""
     force: Overwrite = False
@@ -86,7 +81,7 @@ class Localize(Reading, Deciding, Common):
         else:
             folder = self.kapture(self.query)
         path = self.opened_map(self.input, force=self.force)
-        kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
+        kapture_map = self.open_map(path)
         _check_consistent(kapture_map, self.input, force=self.force)
         options = self.options()
         candidates = None if self.pairs is None else candidates_of(read_pairs(self.pairs))
@@ -134,7 +129,7 @@ class Localize(Reading, Deciding, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve(Reading, Deciding, Common):
+class Serve(ReadingMap, Deciding, Common):
     """Serve localization in a kapture map over HTTP, with a web page for photographs."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
@@ -153,10 +148,6 @@ class Serve(Reading, Deciding, Common):
     """Largest request, megabytes."""
     max_megapixels: float = 32.0
     """Largest image, megapixels."""
-    keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
-    pixel_origin: PixelOriginChoice = "auto"
-    """Pixel origin of the map's intrinsics; auto detects it."""
     force: Overwrite = False
     """Localize in an inconsistent map."""
 
@@ -181,7 +172,7 @@ class Serve(Reading, Deciding, Common):
         options = self.options()
         with bind(self.host, self.port) as bound:
             path = self.opened_map(self.map, force=self.force)
-            kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
+            kapture_map = self.open_map(path)
             _check_consistent(kapture_map, self.map, force=self.force)
             localizer = prepared_localizer(kapture_map, options)
             host = f"[{self.host}]" if ":" in self.host else self.host
