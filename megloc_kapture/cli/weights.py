@@ -109,17 +109,14 @@ class Fetch(Common):
         self.say(f"{weights.name}: {url}")
         self.say(f"  licence: {weights.licence}: {weights.terms}")
         fetch(url, place, sha256=file.sha256, track=self.track)
-        state = "sha256 correct"
-        if file.sha256 is None:
-            downloaded = describe(weights.name, place)
-            state = f"sha256 {sha256_of(downloaded)}; the registry lists no sha256"
-            if not file.convert:
-                try:
-                    read_weights(downloaded)
-                except DataError:
-                    place.unlink()
-                    raise
-        print(f"{weights.name}: {place} ({place.stat().st_size} bytes, {state})")
+        downloaded = describe(weights.name, place)
+        if file.sha256 is None and not file.convert:
+            try:
+                read_weights(downloaded)
+            except DataError:
+                place.unlink()
+                raise
+        print(f"{weights.name}: {place} ({downloaded.size} bytes, {_trust(downloaded)})")
         _say_to_convert(weights, file, place)
 
 
@@ -220,26 +217,23 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
 
 def _wrong(weights: Weights) -> int:
     """Print the state of each file of a network; return the number of problems."""
-    wrong = 0
-    paths = list(files_of(weights))
-    if not paths:
-        print(f"wrong: {how_to_get(weights)}")
-        return 1
-    for path in paths:
-        file = describe(weights.name, path)
+    files = [describe(weights.name, path) for path in files_of(weights)]
+    problems = [] if files else [how_to_get(weights)]
+    for file in files:
         try:
             read_weights(file)
-            print(f"{weights.name}: {path} ({_trust(file)})")
+            print(f"{weights.name}: {file.path} ({_trust(file)})")
         except MeglocError as error:
-            wrong += 1
-            print(f"wrong: {error}")
-    return wrong
+            problems.append(str(error))
+    for problem in problems:
+        print(f"wrong: {problem}")
+    return len(problems)
 
 
 def _trust(file: WeightsFile) -> str:
     if file.published and file.published.sha256:
         return "sha256 correct"
-    return f"loads; sha256 {sha256_of(file)} cannot be checked"
+    return f"sha256 {sha256_of(file)}; the registry lists no sha256"
 
 
 def _state(weights: Weights) -> str:
