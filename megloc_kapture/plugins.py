@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,6 @@ def chosen_by_name(known: Iterable[PluginChoice], names: Iterable[str]) -> list[
     return [of_name.get(name, {"name": name}) for name in names]
 
 
-@runtime_checkable
 class LocalFeatureExtractor(Protocol):
     """Group ``megloc_kapture.local_features``: image to local features.
 
@@ -73,7 +72,6 @@ class LocalFeatureExtractor(Protocol):
         ...
 
 
-@runtime_checkable
 class GlobalFeatureExtractor(Protocol):
     """Group ``megloc_kapture.global_features``: image to one vector, compared by cosine.
 
@@ -89,7 +87,6 @@ class GlobalFeatureExtractor(Protocol):
         ...
 
 
-@runtime_checkable
 class Matcher(Protocol):
     """Group ``megloc_kapture.matchers``: features of two images to matches.
 
@@ -107,7 +104,6 @@ class Matcher(Protocol):
         ...
 
 
-@runtime_checkable
 class Segmenter(Protocol):
     """Group ``megloc_kapture.segmenters``: image to a class per pixel."""
 
@@ -210,7 +206,6 @@ class DepthEstimate:
     normals: NDArray[np.float32]
 
 
-@runtime_checkable
 class DepthEstimator(Protocol):
     """Group ``megloc_kapture.depth_estimators``: an image and its neighbours to depth."""
 
@@ -273,7 +268,6 @@ class RankingScene(Protocol):
         ...
 
 
-@runtime_checkable
 class PoseRanker(Protocol):
     """Group ``megloc_kapture.pose_rankers``: pose hypotheses of one query to scores."""
 
@@ -284,7 +278,6 @@ class PoseRanker(Protocol):
         ...
 
 
-@runtime_checkable
 class ImageDistance(Protocol):
     """Group ``megloc_kapture.image_distances``: two aligned images to a distance."""
 
@@ -301,7 +294,6 @@ class ImageDistance(Protocol):
         ...
 
 
-@runtime_checkable
 class PoseRefiner(Protocol):
     """Group ``megloc_kapture.pose_refiners``: a pose to a better one, or a reason to keep it."""
 
@@ -323,7 +315,6 @@ class PoseRefiner(Protocol):
         ...
 
 
-@runtime_checkable
 class DatasetAdapter(Protocol):
     """Group ``megloc_kapture.datasets``: a dataset's official layout to kapture folders.
 
@@ -345,7 +336,6 @@ class DatasetAdapter(Protocol):
         ...
 
 
-@runtime_checkable
 class RenderedDataset(Protocol):
     """Group ``megloc_kapture.rendered_datasets``: a synthetic dataset with its true poses.
 
@@ -370,7 +360,6 @@ class RenderedDataset(Protocol):
         ...
 
 
-@runtime_checkable
 class StageOfAPlan(Protocol):
     """Group ``megloc_kapture.stages``: a step of a run, see ``megloc_kapture.stages.stage.Stage``.
 

@@ -16,7 +16,7 @@ from scenes import Scene
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.warping import PosedImage
-from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
+from megloc_kapture.plugins import DepthView, PoseRefinement
 from megloc_kapture.refinement.acceptance import RenderingOptions
 from megloc_kapture.refinement.rendering import Rendering, RenderingRefinement
 from megloc_kapture.values import RigidTransform
@@ -145,7 +145,7 @@ def test_the_plugin_takes_the_first_references_that_have_depth(case: Case) -> No
         {name: each.image for name, each in given.items()} | {"query": case.query.image},
     )
     plugin = pickle.loads(pickle.dumps(Rendering(RenderingOptions(max_references=2))))
-    assert isinstance(plugin, PoseRefiner) and plugin.name == "rendering"
+    assert plugin.name == "rendering"
     refine = partial(plugin.refine, "query", case.query.camera, start, scene=scene)
     assert refine(["flat"]).reason == "no reference image has depth" and not scene.asked
     refined = refine(["flat", "0", "1", "2"])
