@@ -176,8 +176,9 @@ class Check(Common):
         check_known(self.dataset)
         require(self.file.exists(), "no such file", path=self.file)
         data = self.data or self._workspace()
-        reference = None if data is None else read_reference(data)
-        if reference is not None and data is not None:
+        reference = None
+        if data is not None:
+            reference = read_reference(data)
             tables = data / SIDE_TABLES
             known = (tables / PROTOCOL_FILE).is_file()
             check_dataset(self.dataset, reference.protocol, tables=tables if known else None)

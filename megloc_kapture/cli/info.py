@@ -59,14 +59,12 @@ class Info(ReadingMap, Common):
         folder = self.kapture(self.opened_map(self.input))
         describe_content(folder)
         folder.validate(deep=self.deep)
-        if sizes := list(describe_sizes(folder)):
-            for text in sizes:
-                line("FAULT", text)
-        else:
-            checked = (
-                "all files and images: no fault found" if self.deep else "files: no fault found"
-            )
-            line("checked", checked)
+        faults = list(describe_sizes(folder))
+        for text in faults:
+            line("FAULT", text)
+        if not faults:
+            checked = "all files and images" if self.deep else "files"
+            line("checked", f"{checked}: no fault found")
         if folder.has_points():
             self._describe_map(folder.root)
         else:

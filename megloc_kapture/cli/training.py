@@ -54,8 +54,8 @@ class Train(Common):
     """Kapture folder with poses and depth to evaluate on; may be repeated."""
     output: Output
     """File to write: X.safetensors; also writes X.json, X.csv, X.state.pt and X.overlaps."""
-    features: str | None = None
-    """Extractor whose features are matched, or whose detector is frozen; if omitted, superpoint."""
+    features: str = "superpoint"
+    """Extractor whose features are matched, or whose detector is frozen."""
     set: Texts = ()
     """Change an option: key.key=value (steps=20000, max_size_px=800); may be repeated."""
     threads: int = 1
@@ -66,8 +66,7 @@ class Train(Common):
     def run(self) -> None:
         from megloc_kapture.training.train import TASKS, train  # loads torch
 
-        changes = {} if self.features is None else {"features.name": self.features}
-        options = options_with(TASKS[self.task], self.set, changes)
+        options = options_with(TASKS[self.task], self.set, {"features.name": self.features})
         last = train(
             options,
             self.output,
