@@ -281,9 +281,6 @@ class PoseRanker(Protocol):
 class ImageDistance(Protocol):
     """Group ``megloc_kapture.image_distances``: two aligned images to a distance."""
 
-    name: str
-    """Name of the distance measure, for reports."""
-
     def distance(
         self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> float:

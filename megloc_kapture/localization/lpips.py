@@ -31,11 +31,9 @@ class LpipsOptions(NetworkOptions):
 class LpipsDistance:
     """Plugin ``lpips``: LPIPS 0.1 (:class:`megloc_kapture.nets.lpips.Lpips`) over the valid pixels.
 
-    Its name is ``lpips-NET`` with the published weights and ``lpips-like-NET`` with others, whose
-    values are not comparable with published ones.
+    Values with other weights are not comparable with published ones.
     """
 
-    name = "lpips"
     Options = LpipsOptions
 
     def __init__(self, options: LpipsOptions | None = None) -> None:
@@ -44,8 +42,6 @@ class LpipsDistance:
         self._trunk, self._heads = find_all_weights(
             [self.options.trunk or f"lpips-trunk-{net}", self.options.heads or f"lpips-{net}"]
         )
-        weights = self.options.trunk or self.options.heads
-        self.name = f"lpips-like-{net}" if weights else f"lpips-{net}"
 
     def weights(self) -> dict[str, str]:
         """Return the sha256 of trunk and heads by file name."""

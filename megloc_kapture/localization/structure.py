@@ -51,7 +51,6 @@ class StructureDistance:
     Gaussian windows over valid pixels. Differences in exposure and shading have little effect.
     """
 
-    name = "structure"
     Options = StructureOptions
 
     def __init__(self, options: StructureOptions | None = None) -> None:
