@@ -97,13 +97,11 @@ class Import(Common):
             counts = choice.import_to(self.root, out)
             work = Work(track=self.track)
             unreadable = set_aside_unreadable(out / QUERY, out / SIDE_TABLES, work)
-            summary = out / SUMMARY_FILE
-            text = summary.read_text(encoding="utf-8") if summary.is_file() else ""
         print_counts(counts)
         for name, reason in unreadable.items():
             self.say(f"warning: query {name} cannot be used and will fail: {reason}")
-        if text:
-            print(text.rstrip())
+        if (summary := self.output / SUMMARY_FILE).is_file():
+            print(summary.read_text(encoding="utf-8").rstrip())
 
     def _import_colmap(self) -> None:
         source = find_colmap(self.root, images=self.images, database=self.database)

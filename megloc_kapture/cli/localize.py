@@ -41,6 +41,7 @@ _log = logging.getLogger(__name__)
 
 _MIN_TOKEN_LENGTH = 16
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_LIMITS = ("threads", "max_waiting", "max_mb", "max_megapixels")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +81,10 @@ class Localize(ReadingMap, Deciding, Common):
                 self.say(text)
         else:
             folder = self.kapture(self.query)
-        path = self.opened_map(self.input, force=self.force)
-        kapture_map = self.open_map(path)
-        _check_consistent(kapture_map, self.input, force=self.force)
-        options = self.options()
+        kapture_map = _consistent_map(self, self.input)
         candidates = None if self.pairs is None else candidates_of(read_pairs(self.pairs))
         # fail before the first query and before anything is written
-        localizer = Localizer(kapture_map, options=options)
+        localizer = Localizer(kapture_map, options=self.options())
         results = Results(
             localizer, folder, workers=workers, candidates=candidates, track=self.track
         )
@@ -99,7 +97,7 @@ class Localize(ReadingMap, Deciding, Common):
                 f"{min(names)}, {min(images)}, 1.0",
                 path=self.pairs,
             )
-        inputs = (path, self.input, self.query, *self.images)
+        inputs = (kapture_map.folder.root, self.input, self.query, *self.images)
         with staged_output(self.output, kind=LOCALIZED, force=self.force, inputs=inputs) as out:
             started = time.perf_counter()
             outcomes = list(results.items())
@@ -155,12 +153,7 @@ class Serve(ReadingMap, Deciding, Common):
         from megloc_kapture.service.app import Service
         from megloc_kapture.service.server import bind, prepared_localizer, serve
 
-        limits: dict[str, Any] = {
-            "threads": self.threads,
-            "max_waiting": self.max_waiting,
-            "max_mb": self.max_mb,
-            "max_megapixels": self.max_megapixels,
-        }
+        limits: dict[str, Any] = {name: getattr(self, name) for name in _LIMITS}
         for name, value in limits.items():
             flag = f"--{name.replace('_', '-')}"
             check_option(value is None or value > 0, f"{flag} {value}: must be positive")
@@ -169,11 +162,9 @@ class Serve(ReadingMap, Deciding, Common):
             raise OptionError(
                 f"--host {self.host}: reachable from other machines; give --token-file"
             )
-        options = self.options()
+        options = self.options()  # wrong ones are refused before the map is read
         with bind(self.host, self.port) as bound:
-            path = self.opened_map(self.map, force=self.force)
-            kapture_map = self.open_map(path)
-            _check_consistent(kapture_map, self.map, force=self.force)
+            kapture_map = _consistent_map(self, self.map)
             localizer = prepared_localizer(kapture_map, options)
             host = f"[{self.host}]" if ":" in self.host else self.host
             where = f"http://{host}:{bound.getsockname()[1]}/"
@@ -198,8 +189,11 @@ def _read_token(path: Path) -> str:
     return token
 
 
-def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
-    """Raise DataError for an inconsistent map; if forced, warn."""
+def _consistent_map(command: Localize | Serve, path: Path) -> KaptureMap:
+    """Open a map or COLMAP model; raise DataError for an inconsistent map, or warn if forced."""
+    kapture_map = command.open_map(command.opened_map(path, force=command.force))
     if fault := kapture_map.fault():
-        require(force, f"{fault}; the poses would be wrong (--force localizes anyway)", path=path)
+        message = f"{fault}; the poses would be wrong (--force localizes anyway)"
+        require(command.force, message, path=path)
         _log.warning("%s: %s; the poses may be wrong", path, fault)
+    return kapture_map
