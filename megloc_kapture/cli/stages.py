@@ -34,6 +34,7 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, writ
 from megloc_kapture.io.kapture.features import features_dir_hint
 from megloc_kapture.io.output_folders import check_new_file
 from megloc_kapture.matching.verification import KnownPoseOptions
+from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import (
     DEFAULT_PRESET,
@@ -277,7 +278,7 @@ class PairsMapping(Reading, Choosing, Working):
         retrieval = None
         if "retrieval" in self.by:
             retrieval = _retrieval(mapping, self.features, self.fusion, chosen)
-        with self.working(self.output):
+        with single_threaded():
             pairs = pair_map_images(
                 mapping,
                 options,
@@ -332,7 +333,7 @@ class PairsQuery(Reading, Choosing, Working):
         retrieval = None
         if not self.exhaustive:
             retrieval = _retrieval(mapping, self.features, self.fusion, options)
-        with self.working(self.output):
+        with single_threaded():
             pairs = pair_queries(
                 mapping,
                 query,
