@@ -90,21 +90,21 @@ def _parser(given: Sequence[str]) -> Any:
 
     from megloc_kapture.plugin_names import STAGES, plugin_names
 
-    stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
-    if given and not given[0].startswith("-") and given[0] not in [*COMMANDS, *stages]:
-        known = suggestion(given[0], [*COMMANDS, *stages], listed="commands: ")
+    texts = _help_texts()
+    for stage in (name.replace("_", "-") for name in plugin_names(STAGES)):
+        texts.setdefault(stage, f"Run the stage {stage} of a third-party package.")
+    if given and not given[0].startswith("-") and given[0] not in texts:
+        known = suggestion(given[0], texts, listed="commands: ")
         raise OptionError(f"unknown command {given[0]!r}; {known}")
     annotated: Any = Annotated  # mypy does not follow runtime types
     completes = given[:1] and given[0].startswith("--tyro-")  # shell completion needs all commands
-    texts = {name: f"Run the stage {name} of a third-party package." for name in stages}
-    texts |= _help_texts()
     commands = []
-    for name in [*COMMANDS, *(name for name in stages if name not in COMMANDS)]:
+    for name, text in texts.items():
         # a stage that fails to load must not break other commands
         asked = name in given[:1] or (completes and name in COMMANDS)
         kind = command_class(name) if asked else make_dataclass(name.replace("-", "_"), [])
-        text = kind.__doc__ if asked and name not in COMMANDS else texts[name]
-        commands.append(annotated[kind, tyro.conf.subcommand(name, description=text)])
+        shown = kind.__doc__ if asked and name not in COMMANDS else text
+        commands.append(annotated[kind, tyro.conf.subcommand(name, description=shown)])
     return functools.reduce(operator.or_, commands)
 
 
