@@ -34,7 +34,7 @@ from megloc_kapture.pipeline.presets import (
     options_of,
     options_of_preset,
 )
-from megloc_kapture.plugin_loading import load_plugin, plugin_class, plugin_names
+from megloc_kapture.plugin_loading import load_chosen, plugin_class, plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PROTOCOLS, RENDERED_DATASETS, PluginChoice
 from megloc_kapture.stages.global_features import VLAD
 from megloc_kapture.stages.scene import depth_records
@@ -156,7 +156,7 @@ def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
     if extractor is None:
         return f"must be in the query's kapture folder: no extractor for {local_type} is installed"
     try:
-        load_plugin(LOCAL_FEATURES, extractor.name, extractor.options)
+        load_chosen(LOCAL_FEATURES, extractor)
     except MeglocError as error:
         absent = f"plugin {extractor.name} could extract them, but {error}"
         return f"must be in the query's kapture folder; {absent}"

@@ -472,17 +472,14 @@ class Preprocess(Computing, Working):
         return options_with(PreprocessingOptions, given, flags)
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
-        for camera, value in _by_camera("--bottom-share", self.bottom_share):
-            yield {"camera": camera, "bottom_share": value}
-        for camera, value in _by_camera("--polygon", self.polygon):
-            yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
-        for camera, value in _by_camera("--mask-file", self.mask_file):
-            yield {"camera": camera, "file": value}
-
-
-def _by_camera(flag: str, texts: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield camera and value of each ``CAMERA=VALUE``, split at the last ``=``."""
-    for text in texts:
-        camera, _, value = text.rpartition("=")
-        check_option(camera and value, f"{flag} takes CAMERA=VALUE, got {text!r}")
-        yield camera, value
+        """Yield the mask of each ``CAMERA=VALUE``, split at the last ``=``."""
+        for flag, key, texts in (
+            ("--bottom-share", "bottom_share", self.bottom_share),
+            ("--polygon", "polygon", self.polygon),
+            ("--mask-file", "file", self.mask_file),
+        ):
+            for text in texts:
+                camera, _, value = text.rpartition("=")
+                check_option(camera and value, f"{flag} takes CAMERA=VALUE, got {text!r}")
+                corners = [corner.split(",") for corner in value.split()]
+                yield {"camera": camera, key: corners if key == "polygon" else value}
