@@ -69,7 +69,6 @@ class LocalFeatureExtractor(Protocol):
         Raise DataError, without a path, to reject an image, for example if it is too small; guided
         pyramid matching then skips that scale or rotation.
         """
-        ...
 
 
 class GlobalFeatureExtractor(Protocol):
@@ -84,7 +83,6 @@ class GlobalFeatureExtractor(Protocol):
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Describe an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
-        ...
 
 
 class Matcher(Protocol):
@@ -101,7 +99,6 @@ class Matcher(Protocol):
 
         Each row of a or b occurs at most once. Verification begins with the highest scores.
         """
-        ...
 
 
 class Segmenter(Protocol):
@@ -116,7 +113,6 @@ class Segmenter(Protocol):
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return labels uint8 (H, W) of an RGB image, uint8 (H, W, 3)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +221,6 @@ class DepthEstimator(Protocol):
         sources : at least one, best first.
         depth_range_m : nearest and farthest possible depth.
         """
-        ...
 
 
 class RankingScene(Protocol):
@@ -233,39 +228,30 @@ class RankingScene(Protocol):
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
         """Return RGB pixels (H, W, 3) of a query image; DataError if they are missing."""
-        ...
 
     def query_mask(self, name: str) -> NDArray[np.bool_] | None:
         """Return the mask (H, W) of a query image, True = use, or None."""
-        ...
 
     def query_depth(self, name: str) -> DepthView | None:
         """Return the depth map of a query image, or None."""
-        ...
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
         """Return RGB pixels (H, W, 3) of a map image; DataError if they are missing."""
-        ...
 
     def map_mask(self, name: str) -> NDArray[np.bool_] | None:
         """Return the mask (H, W) of a map image, True = use, or None."""
-        ...
 
     def map_depth(self, name: str) -> DepthView | None:
         """Return the depth map of a map image, or None."""
-        ...
 
     def map_points(self, name: str) -> NDArray[np.float64]:
         """Return the map points observed by an image, (N, 3), in the world frame."""
-        ...
 
     def map_camera(self, name: str) -> Camera:
         """Return the camera of a map image."""
-        ...
 
     def map_pose(self, name: str) -> RigidTransform:
         """Return ``cam_from_world`` of a map image."""
-        ...
 
 
 class PoseRanker(Protocol):
@@ -275,7 +261,6 @@ class PoseRanker(Protocol):
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
         """Return one score per hypothesis, (H,); higher is better, and the first wins a tie."""
-        ...
 
 
 class ImageDistance(Protocol):
@@ -288,7 +273,6 @@ class ImageDistance(Protocol):
 
         A lower distance means more similar images; it is infinite if too few pixels are valid.
         """
-        ...
 
 
 class PoseRefiner(Protocol):
@@ -309,7 +293,6 @@ class PoseRefiner(Protocol):
 
         ``references`` are map images that may overlap with the query image, best first.
         """
-        ...
 
 
 class DatasetAdapter(Protocol):
@@ -326,11 +309,9 @@ class DatasetAdapter(Protocol):
 
     def check(self, root: Path) -> None:
         """Check quickly whether ``root`` can be this dataset; DataError if not."""
-        ...
 
     def read(self, root: Path, *, allow_missing: bool = False) -> Any:
         """Read the dataset; DataError names the file and line."""
-        ...
 
 
 class RenderedDataset(Protocol):
@@ -346,7 +327,6 @@ class RenderedDataset(Protocol):
     @property
     def options(self) -> Options:
         """Return all parameters that determine the files."""
-        ...
 
     def write(self, root: Path, work: Any) -> Mapping[str, float]:
         """Render the dataset below ``root``, with a ``megloc_kapture.stages.work.Work``.
@@ -354,7 +334,6 @@ class RenderedDataset(Protocol):
         Return counts for the log. The bytes depend on the options alone. Raise OutputError if the
         files cannot be written.
         """
-        ...
 
 
 class StageOfAPlan(Protocol):
@@ -372,7 +351,6 @@ class StageOfAPlan(Protocol):
 
     def run(self, work: Any) -> Mapping[str, float]:
         """Run the stage with a ``megloc_kapture.stages.stage.StageWork``; return counts."""
-        ...
 
 
 PROTOCOLS: dict[str, type] = {
