@@ -77,8 +77,6 @@ class Localize(ReadingMap, Deciding, Common):
         folder: KaptureFolder | Photographs
         if self.query is None:
             folder = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
-            if text := folder.describe():
-                self.say(text)
         else:
             folder = self.kapture(self.query)
         kapture_map = _consistent_map(self, self.input)

@@ -69,8 +69,6 @@ class MapPhotographs(Choosing, Working):
     def run(self) -> None:
         options = options_of_photographs(self.preset or DEFAULT_PRESET, self.assignments())
         photographs = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
-        if text := photographs.describe():
-            self.say(text)
         stages = plan_photographs(photographs, options, self.mapper, self.scale)
         workspace = Workspace(self.output, force=self.force)
         with self.working_in(workspace) as work:

@@ -348,20 +348,13 @@ class Photographs(Queries):
                 f"the list of cameras names none of the images, for example {self.names[0]}: the "
                 "first field of each row is an image name"
             )
+        if self.without_row:
+            shown, more = ", ".join(self.without_row[:5]), ", ..." if self.without_row[5:] else ""
+            message = "%d images are not in the list of cameras; their cameras are estimated: %s%s"
+            _log.warning(message, len(self.without_row), shown, more)
 
     def known_cameras(self) -> bool:
         return all(photo.camera.focal_deviation == 0 for photo in self._photos.values())
-
-    def describe(self) -> str:
-        """Describe images that are missing from the camera list, if any."""
-        names = self.without_row
-        if not names:
-            return ""
-        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-        return (
-            f"{len(names)} images are not in the list of cameras; their cameras are estimated: "
-            f"{', '.join(names[:5])}{more}"
-        )
 
     def query(self, name: str) -> Query:
         photo, path = self._photos[name], self._paths[name]
