@@ -25,17 +25,13 @@ from megloc_kapture.evaluation.pose_files import (
     write_provenance,
 )
 from megloc_kapture.io.dataset_tables import (
+    NO_TABLES,
     PROTOCOL_FILE,
     RELOCALIZATION_FILE,
-    ImageGroup,
     Protocol,
-    World,
-    read_groups,
-    read_names,
-    read_protocol,
-    read_relocalization,
+    SideTables,
+    read_side_tables,
     read_unreadable,
-    read_world,
 )
 from megloc_kapture.io.files import read_text, safe_join, temporary_name, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureFolder
@@ -104,15 +100,16 @@ def write_submission(
     ``dummies``, MLAD rows with an identity pose.
     """
     beside = None if tables is None else tables.parent
-    rules = Protocol() if tables is None else read_protocol(tables)
+    side = NO_TABLES if tables is None else read_side_tables(tables)
     results = _read_results(localized, beside, from_rig=from_rig)
     unreadable = {} if tables is None else read_unreadable(tables)
-    if rules.pose_file == "mlad" and tables is not None:
-        texts, posed, missing = _mlad(results, tables)
+    is_mlad = side.protocol.pose_file == "mlad"
+    if is_mlad and tables is not None:
+        texts, posed, missing = _mlad(results, side, tables)
         for name, text in texts.items():
             write_bytes(safe_join(place, name), text.encode("ascii"))
     else:
-        texts, posed, missing = _ltvl(results, tables, rules, unreadable)
+        texts, posed, missing = _ltvl(results, side, unreadable)
         write_bytes(place, texts[""].encode("utf-8"))
     counts = {
         "queries": len(results) + len(unreadable),
@@ -122,7 +119,7 @@ def write_submission(
         "doubtful": len({image for _, image in missing if _is_doubtful(results.get(image))}),
         "fallbacks": sum(results[image].fallback == "retrieval" for image in posed),
         "from_rig": sum(results[image].fallback == "rig" for image in posed),
-        "dummies": len(missing) if rules.pose_file == "mlad" else 0,
+        "dummies": len(missing) if is_mlad else 0,
     }
     known = set(posed)
     imported = None if beside is None else read_manifests(beside).get("import")
@@ -135,10 +132,9 @@ def write_submission(
             if image in known and result.status == "localized" and result.confidence is not None
         },
         "dataset_fingerprint": None if imported is None else imported.fingerprint,
-        "dummies" if rules.pose_file == "mlad" else "missing": [row for row, _ in missing],
+        "dummies" if is_mlad else "missing": [row for row, _ in missing],
     }
-    files = None if rules.pose_file == "ltvl" else list(texts)
-    write_provenance(place, entries, counts=counts, files=files)
+    write_provenance(place, entries, counts=counts, files=list(texts) if is_mlad else None)
     return counts
 
 
@@ -188,49 +184,40 @@ def _posed(results: _Results) -> dict[str, RigidTransform]:
     return {image: pose for image, pose in poses.items() if pose is not None}
 
 
-def _ltvl(
-    results: _Results, tables: Path | None, rules: Protocol, unreadable: Collection[str]
-) -> _Content:
+def _ltvl(results: _Results, side: SideTables, unreadable: Collection[str]) -> _Content:
     poses = _posed(results)
-    names = {} if tables is None else read_names(tables)
-    world = World() if tables is None else read_world(tables)
-    images = list(names)
-    if not names:
-        groups = {} if tables is None else read_groups(tables)
-        every = sorted({*results, *unreadable})
-        images = [image for image in every if groups.get(image, ImageGroup()).scored]
+    names, rule = side.names, side.protocol.pose_file_names
+    images = list(names) or sorted(side.scored({*results, *unreadable}))
     posed = [image for image in images if image in poses]
-    rule = rules.pose_file_names
     unnamed = [] if names else [i for i in posed if not is_name(name_by_rule(i, rule))]
     if unnamed:
         message = "%d images are left out: names in a pose file cannot contain white space: %s%s"
         more = ", ..." if len(unnamed) > 1 else ""
         _log.warning(message, len(unnamed), repr(unnamed[0]), more)
         posed = sorted(set(posed) - set(unnamed))
-    official = {image: world.pose_in_official(poses[image]) for image in posed}
+    official = {image: side.world.pose_in_official(poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rule)
     with_row = set(posed)
     return {"": text}, posed, [(image, image) for image in images if image not in with_row]
 
 
-def _mlad(results: _Results, tables: Path) -> _Content:
+def _mlad(results: _Results, side: SideTables, tables: Path) -> _Content:
     """Return texts by file name, the query of each row with a pose, and the rows without a pose.
 
     A row without a pose is given by its description and its query.
     """
-    pairs = read_relocalization(tables)
     require(
-        pairs,
+        side.relocalization,
         "no pairs, which an MLAD challenge needs: was the dataset imported with its "
         "relocalization files?",
         path=tables / RELOCALIZATION_FILE,
     )
     poses = _posed(results)
-    scale = read_world(tables).official_from_local.scale
+    scale = side.world.official_from_local.scale
     references = KaptureFolder(tables.parent / MAPPING).read().poses()
     rows: dict[str, dict[tuple[int, int], RigidTransform]] = {}
     posed, missing = [], []
-    for pair in pairs:
+    for pair in side.relocalization:
         query, reference = poses.get(pair.query), references.get(pair.reference)
         if query is None or reference is None:
             missing.append((f"{pair.file}: {pair.reference} {pair.query}", pair.query))
