@@ -130,10 +130,7 @@ def cluster_candidates(
 
 def _components(count: int, pairs: NDArray[np.integer]) -> NDArray[np.int64]:
     links = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    _, labels = connected_components(links, directed=False)
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    order = np.argsort(np.argsort(first))
-    return np.asarray(order[inverse], np.int64)
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
 def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
@@ -356,32 +353,34 @@ def poses_of_cameras(
 
     A camera without inliers fails, even though the rig has a pose.
     """
-    assert rig.inliers is not None
+    assert rig.inliers is not None and rig.covariance is not None
+    assert rig.inlier_points_px is not None and rig.inlier_points_world is not None
+    of_views = problem.split(rig.inliers)
+    starts = np.cumsum([inliers.sum() for inliers in of_views])[:-1]
+    px_of_views = np.split(rig.inlier_points_px, starts)
+    points_of_views = np.split(rig.inlier_points_world, starts)
     cameras: list[Pose | Failure] = []
-    end = 0
-    for view, inliers in zip(views, problem.split(rig.inliers), strict=True):
-        start, end = end, end + int(inliers.sum())
+    for view, inliers, px, points in zip(
+        views, of_views, px_of_views, points_of_views, strict=True
+    ):
         clusters = tuple(
             cluster
             if cluster.cam_from_world is None
             else replace(cluster, cam_from_world=view.cam_from_rig @ cluster.cam_from_world)
             for cluster in rig.clusters
         )
-        px, points = rig.inlier_points_px, rig.inlier_points_world
         pose = replace(
             rig,
             name=view.name,
             cam_from_world=view.cam_from_rig @ rig.cam_from_world,
             clusters=clusters,
             num_matches=len(inliers),
-            num_inliers=end - start,
+            num_inliers=len(px),
             inliers=inliers,
-            inlier_points_px=None if px is None else px[start:end],
-            inlier_points_world=None if points is None else points[start:end],
+            inlier_points_px=px,
+            inlier_points_world=points,
+            covariance=transform_covariance(rig.covariance, view.cam_from_rig),
         )
-        if pose.covariance is not None:
-            moved = transform_covariance(pose.covariance, view.cam_from_rig)
-            pose = replace(pose, covariance=moved)
         failure = Failure(
             "no inlier in this camera; other cameras of its rig were localized",
             name=view.name,
@@ -390,5 +389,5 @@ def poses_of_cameras(
             clusters=clusters,
             seconds=rig.seconds,
         )
-        cameras.append(pose if start < end else failure)
+        cameras.append(pose if len(px) else failure)
     return cameras

@@ -22,7 +22,7 @@ ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
 
 @dataclass(frozen=True, eq=False)
 class MapIndex:
-    """Observations grouped by image; read-only, for use by several threads.
+    """Observations grouped by image; never changed, as several threads use them.
 
     Attributes
     ----------
@@ -64,11 +64,11 @@ class MapIndex:
         for first, last in pairwise(offsets.tolist()):
             keys[first:last].sort()
         return cls(
-            xyz=_read_only(np.ascontiguousarray(xyz, dtype=np.float64)),
+            xyz=np.ascontiguousarray(xyz, dtype=np.float64),
             row_of_image={name: row for row, name in enumerate(image_names)},
-            offsets=_read_only(offsets),
-            keypoint_ids=_read_only((keys >> 32).astype(np.int32)),
-            point_ids=_read_only((keys & 0xFFFFFFFF).astype(np.int32)),
+            offsets=offsets,
+            keypoint_ids=(keys >> 32).astype(np.int32),
+            point_ids=(keys & 0xFFFFFFFF).astype(np.int32),
             covariances=covariances,
         )
 
@@ -109,12 +109,6 @@ class MapIndex:
 def _paired(high: Integers, low: Integers) -> NDArray[np.int64]:
     """Pack two indices of 31 bits into one number, for faster sorting."""
     return (high.astype(np.int64) << 32) | low
-
-
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
-    view = array.view()
-    view.setflags(write=False)
-    return view
 
 
 @dataclass(frozen=True, eq=False)

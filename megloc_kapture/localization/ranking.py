@@ -28,7 +28,7 @@ from megloc_kapture.plugins import (
     PoseHypothesis,
     RankingScene,
 )
-from megloc_kapture.values import Camera, Device, Options, RigidTransform
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 
 class InlierCount:
@@ -113,7 +113,7 @@ _Compared = tuple[NDArray[np.uint8], WarpedView]
 _ANOTHER_VIEW = 0.2  # views that differ by less are near duplicates, see _nearest_first
 
 
-class PerceptualOptions(Options):
+class PerceptualOptions(NetworkOptions):
     references: int = Field(
         default=5,
         ge=1,
@@ -127,12 +127,6 @@ class PerceptualOptions(Options):
     distance: PluginChoice = Field(
         default=PluginChoice(name="structure"),
         description="distance of two aligned images: structure, lpips, or a plugin",
-    )
-    device: Device = Field(
-        default="auto", description="device of the distance: auto, cpu, cuda or cuda:N"
-    )
-    half_precision: bool = Field(
-        default=False, description="compute the distance in half precision"
     )
     min_inlier_share: float = Field(
         default=0.05,
@@ -190,14 +184,11 @@ class PerceptualRanker:
         enough = self.options.min_inlier_share * max(inliers)
         read = cache(scene.query_image), cache(partial(image_with_depth, scene=scene))
         compared = [
-            self._views(each, scene, *read) if count >= enough else None
+            self._views(each, scene, *read) if count >= enough else []
             for each, count in zip(hypotheses, inliers, strict=True)
         ]
         distances = np.array(
-            [
-                np.inf if v is None else self._mean_distance(v, [warped.valid for _, warped in v])
-                for v in compared
-            ]
+            [self._mean_distance(v, [warped.valid for _, warped in v]) for v in compared]
         )
         compared_rows = np.flatnonzero(np.isfinite(distances))
         if not np.isfinite(distances[int(np.argmax(otherwise))]):
@@ -236,7 +227,7 @@ class PerceptualRanker:
 
     def _against_each_other(
         self,
-        finalists: Sequence[Sequence[_Compared] | None],
+        finalists: Sequence[Sequence[_Compared]],
         distances: Floats,
         at: NDArray[np.int64],
     ) -> Floats:
@@ -244,8 +235,6 @@ class PerceptualRanker:
         margins = np.zeros(len(finalists))
         for i, first in enumerate(finalists):
             for j, second in enumerate(finalists[:i]):
-                if first is None or second is None:
-                    continue
                 both = [a.valid & b.valid for (_, a), (_, b) in zip(first, second, strict=True)]
                 margin = self._mean_distance(second, both) - self._mean_distance(first, both)
                 if not np.isfinite(margin):  # too few pixels are valid in both
