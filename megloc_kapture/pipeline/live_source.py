@@ -348,7 +348,9 @@ class MapMatching:
         return self.rank(image, features, permitted), True
 
     def ranked(self, image: QueryImage) -> list[str]:
-        """Return the most similar map images, best first, with reranking if enabled."""
+        """Return the given candidates, or the most similar map images, best first."""
+        if image.query.candidates is not None:
+            return self._usable(image.query, image.query.candidates)
         features = self.features(image)
         images = self.rank(image, features, self._permitted(image.query))
         if self.options.reranking.reranks():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import cached_property
@@ -93,37 +93,24 @@ class Localizer:
         self,
         queries: Iterable[Query | tuple[Path | str | NDArray[np.uint8], Camera]],
         executor: Executor | None = None,
-        *,
-        candidates: Mapping[str, Sequence[str]] | None = None,
     ) -> Iterator[Pose | Failure]:
         """Localize each query separately and lazily, in order.
 
-        ``executor`` must be a thread pool, as the workers share the map. ``candidates`` are map
-        images by query name, which replace retrieval.
+        ``executor`` must be a thread pool, as the workers share the map.
         """
         wrapped = (q if isinstance(q, Query) else _query_of(*q) for q in queries)
         units = (((query, _ALONE),) for query in wrapped)
-        for results in self.localize_units(units, executor, candidates=candidates):
+        for results in self.localize_units(units, executor):
             yield from results
 
     def localize_units(
-        self,
-        units: Iterable[Unit],
-        executor: Executor | None = None,
-        *,
-        candidates: Mapping[str, Sequence[str]] | None = None,
+        self, units: Iterable[Unit], executor: Executor | None = None
     ) -> Iterator[list[Pose | Failure]]:
         """Localize images or rigs (units), and yield one result per camera for each unit.
 
         A rig without a joint pose is localized camera by camera. If an image file cannot be
         decoded, all images of its unit fail.
         """
-        if candidates is not None:
-            known = candidates
-            units = (
-                tuple((replace(q, candidates=tuple(known.get(q.name, ()))), at) for q, at in unit)
-                for unit in units
-            )
         return ordered_map(self._localize_readable, units, executor)
 
     def localize_query(self, query: Query) -> Pose | Failure:
@@ -177,7 +164,10 @@ class Localizer:
         return {image: pose.center() for image, pose in self.map.poses.items()}
 
     def ranked(self, query: Query) -> list[str]:
-        """Return the most similar map images of a query, best first, with reranking if enabled."""
+        """Return the given candidates of a query, or the most similar map images, best first.
+
+        The latter are reranked if enabled.
+        """
         return self.matching.ranked(self.matching.image(query))
 
 

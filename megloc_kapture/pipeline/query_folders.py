@@ -47,7 +47,7 @@ from megloc_kapture.io.output_folders import MARKER
 from megloc_kapture.io.text_lines import find_camera
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
-from megloc_kapture.pipeline.queries import Query, Unit
+from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
 from megloc_kapture.stages.local_features import check_lengths, mask_path, warn_of_other_size
@@ -60,6 +60,8 @@ FRAMES_EVERY = 30
 # number of queries whose keypoints are compared with the image size, and of keypoints each needs
 _QUERIES_COMPARED = 10
 _LIST_SUFFIXES = (".txt", ".csv")
+_NOTHING = np.zeros((0, 2), np.float32)
+_NO_FEATURES = LocalFeatures(_NOTHING, _NOTHING[:, 0], _NOTHING)
 
 
 class Queries(ABC):
@@ -94,13 +96,9 @@ class Queries(ABC):
         usable = (tuple(pair for pair in unit if pair[0] not in self.unreadable) for unit in units)
         return [unit for unit in usable if unit]
 
-    def read(self, unit: scene.Unit) -> Unit:
-        """Return the queries of a unit; pixels are read lazily."""
-        return tuple((self.query(name), cam_from_rig) for name, cam_from_rig in unit)
-
     @abstractmethod
     def query(self, name: str) -> Query:
-        """Return a query by name."""
+        """Return a query by name; pixels are read lazily."""
 
     @abstractmethod
     def data(self) -> KaptureData:
@@ -241,7 +239,8 @@ class KaptureQueries(Queries):
             }
         except DataError as error:
             self.faults[name] = str(error)
-            features, of_image, candidates = self._no_features(), {}, ()
+            # no extraction either, as without candidates the features do not matter
+            features, of_image, candidates = dict.fromkeys(self._local, _NO_FEATURES), {}, ()
         return Query(
             camera=self._camera(name),
             image=self._folder.image_path(name),
@@ -268,14 +267,6 @@ class KaptureQueries(Queries):
             base: _stored_features(stored, name)
             for base, stored in self._local.items()
             if name in stored
-        }
-
-    def _no_features(self) -> dict[str, LocalFeatures]:
-        configs = {base: stored.stored_descriptors.config for base, stored in self._local.items()}
-        none = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
-        return {
-            base: LocalFeatures(*none, np.zeros((0, config.dsize), config.dtype))
-            for base, config in configs.items()
         }
 
 
@@ -327,18 +318,18 @@ class Photographs(Queries):
         files = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent
         self.without_row: list[str] = []
+        self._given, self._every = camera, every or FRAMES_EVERY
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
         self._scaled: list[tuple[Camera, Camera]] = []
-        videos = [name for name in files if Path(name).suffix.lower() in VIDEO_SUFFIXES]
         self._paths: dict[str, Path] = {}
         self._photos: dict[str, Photo] = {}
         self._frames: tempfile.TemporaryDirectory[str] | None = None
         for name, path in files.items():
             try:
-                if name in videos:
-                    self._add_video(name, path, camera, every or FRAMES_EVERY)
+                if path.suffix.lower() in VIDEO_SUFFIXES:
+                    self._add_video(name, path)
                 else:
-                    self._add(name, path, camera)
+                    self._add(name, path)
             except DataError as error:
                 self.unreadable[name] = error.message
         self.names = sorted(self._photos)
@@ -401,7 +392,8 @@ class Photographs(Queries):
         """Return whether an image is a frame of a video, in the temporary folder of frames."""
         return self._frames is not None and self._paths[name].is_relative_to(self._frames.name)
 
-    def _add(self, name: str, path: Path, given: Camera | Mapping[str, Camera] | None) -> None:
+    def _add(self, name: str, path: Path) -> None:
+        given = self._given
         camera = given if isinstance(given, Camera) else self._calibrated.get(name)
         if isinstance(given, Mapping):
             camera = find_camera(given, name, path)
@@ -416,14 +408,12 @@ class Photographs(Queries):
         check_image_size(path, fitted)
         self._photos[name], self._paths[name] = Photo(fitted), path
 
-    def _add_video(
-        self, name: str, path: Path, camera: Camera | Mapping[str, Camera] | None, every: int
-    ) -> None:
+    def _add_video(self, name: str, path: Path) -> None:
         if self._frames is None:
             self._frames = tempfile.TemporaryDirectory(prefix=TEMPORARY)
         folder = Path(self._frames.name) / name
-        for frame in extract_frames(path, folder, every):
-            self._add(f"{name}/{frame}", folder / frame, camera)
+        for frame in extract_frames(path, folder, self._every):
+            self._add(f"{name}/{frame}", folder / frame)
 
 
 def _calibrated(root: Path) -> dict[str, Camera]:

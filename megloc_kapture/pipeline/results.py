@@ -19,6 +19,7 @@ from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, status_row, write_consistency
 from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs, Queries
 from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.stage import LOCALIZED
@@ -141,11 +142,17 @@ class Results(Mapping[str, Pose | Failure]):
             except DataError as error:
                 raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error
 
+    def _query(self, name: str) -> Query:
+        query = self.queries.query(name)
+        if self._candidates is None:
+            return query
+        return replace(query, candidates=self._candidates.get(name, ()))
+
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         executor = ThreadPoolExecutor(workers)
         try:
-            units = map(self.queries.read, self._units)
-            results = self.localizer.localize_units(units, executor, candidates=self._candidates)
+            units = (tuple((self._query(name), at) for name, at in unit) for unit in self._units)
+            results = self.localizer.localize_units(units, executor)
             tracked = track(results, len(self._units), "localizing")
             if isinstance(self.queries, Photographs):
                 alone = [outcome for (outcome,) in tracked]
@@ -178,14 +185,8 @@ class Results(Mapping[str, Pose | Failure]):
         for name, result in self.items():
             if result or name in self.queries.faults or name in self.queries.unreadable:
                 continue
-            ranked: Sequence[str] = ()
-            if self._candidates is not None:
-                ranked = self._candidates.get(name, ())
-            else:
-                # undecodable images fail here as in localization
-                with contextlib.suppress(DataError):
-                    ranked = self.localizer.ranked(self.queries.query(name))
-            first = next((image for image in ranked if image in poses), None)
-            if first is not None:
-                best[name] = (first, poses[first])
+            # undecodable images fail here as in localization
+            with contextlib.suppress(DataError):
+                for first in self.localizer.ranked(self._query(name))[:1]:
+                    best[name] = (first, poses[first])
         return best
