@@ -116,19 +116,14 @@ def focal_misfit(
         return None
     # the inliers of a grossly wrong focal length favour it, or their fit does not converge, so
     # search again among all matches
-    free = focal_from_matches(
-        problem.points_px, problem.points, given, options.max_error_px, options.seed
-    )
-    if free is not None:
-        other = _with_camera(problem, scale_focal(given, free / focal_px(given)))
-        estimate = estimate_pose(other, options)
-        if isinstance(estimate, PoseEstimate):
-            start = estimate.rig_from_world, estimate.inliers
-            second = _freed(other, given, *start, options.max_error_px)
-            if second is not None and (
-                estimate.num_inliers > pose.num_inliers if fit is None else second.cost < fit.cost
-            ):
-                fit = second
+    if (found := _with_focal_from_matches(problem, options)) is not None:
+        other, estimate = found
+        start = estimate.rig_from_world, estimate.inliers
+        second = _freed(other, given, *start, options.max_error_px)
+        if second is not None and (
+            estimate.num_inliers > pose.num_inliers if fit is None else second.cost < fit.cost
+        ):
+            fit = second
     if fit is None or not fit.contradicts:
         return None
     shift = np.linalg.norm(fit.rig_from_world.center() - pose.cam_from_world.center())
@@ -234,17 +229,9 @@ def estimate_with_intrinsics(
     """
     given = problem.views[0].camera
     best = estimate_pose(problem, options)
-    free = focal_from_matches(
-        problem.points_px, problem.points, given, options.max_error_px, options.seed
-    )
-    if free is not None:
-        other = _with_camera(problem, _scaled(given, free))
-        of_other = estimate_pose(other, options)
-        if (
-            isinstance(of_other, PoseEstimate)
-            and of_other.num_inliers > best.num_inliers
-            and _is_possible(other, of_other, given)
-        ):
+    if (found := _with_focal_from_matches(problem, options)) is not None:
+        other, of_other = found
+        if of_other.num_inliers > best.num_inliers and _is_possible(other, of_other, given):
             problem, best = other, of_other
     if isinstance(best, PoseEstimate):
         fit = _fit(problem, best.rig_from_world, best.inliers, given)
@@ -256,12 +243,26 @@ def estimate_with_intrinsics(
     return problem, best
 
 
-def _scaled(given: Camera, focal: float) -> Camera:
-    """Set the focal length; weaken the prior if the matches contradict it."""
-    camera = scale_focal(given, focal / focal_px(given))
-    if abs(math.log(focal / focal_px(given))) > _MAX_DEVIATIONS * given.focal_deviation:
-        return replace(camera, focal_deviation=max(_DOUBTED_DEVIATION, given.focal_deviation))
-    return camera
+def _with_focal_from_matches(
+    problem: PoseProblem, options: AbsolutePoseOptions
+) -> tuple[PoseProblem, PoseEstimate] | None:
+    """Estimate the focal length from all matches, and the pose with it; None if either fails.
+
+    The prior in the camera of the returned problem is weaker if the matches contradict it.
+    """
+    given = problem.views[0].camera
+    free = focal_from_matches(
+        problem.points_px, problem.points, given, options.max_error_px, options.seed
+    )
+    if free is None:
+        return None
+    factor = free / focal_px(given)
+    camera = scale_focal(given, factor)
+    if abs(math.log(factor)) > _MAX_DEVIATIONS * given.focal_deviation:
+        camera = replace(camera, focal_deviation=max(_DOUBTED_DEVIATION, given.focal_deviation))
+    other = _with_camera(problem, camera)
+    estimate = estimate_pose(other, options)
+    return (other, estimate) if isinstance(estimate, PoseEstimate) else None
 
 
 def _is_possible(problem: PoseProblem, estimate: PoseEstimate, given: Camera) -> bool:
