@@ -124,11 +124,7 @@ def options_of_preset(
     """
     if preset not in PRESETS:
         raise OptionError(f"unknown preset {preset!r}; {suggestion(preset, PRESETS)}")
-    tree = PRESETS[preset].model_dump()
-    for change in changes:
-        _merge(tree, change)
-    _merge(tree, assigned(assignments))
-    return _validated(PipelineOptions, tree)
+    return _changed(PRESETS[preset], *changes, assigned(assignments))
 
 
 def options_with(
@@ -136,13 +132,13 @@ def options_with(
     assignments: Sequence[str] | Mapping[str, Any],
     changes: Mapping[str, Any] | None = None,
 ) -> OptionsT:
-    tree = model().model_dump()
-    _merge(tree, assigned(changes or {}))
-    _merge(tree, assigned(assignments))
-    return _validated(model, tree)
+    return _changed(model(), assigned(changes or {}), assigned(assignments))
 
 
-def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
+def _changed(options: OptionsT, *changes: dict[str, Any]) -> OptionsT:
+    model, tree = type(options), options.model_dump()
+    for change in changes:
+        _merge(tree, change)
     try:
         return model.model_validate(tree)
     except ValidationError as error:
