@@ -95,7 +95,8 @@ def evidence_of(
     visible = _num_visible(problem, rig_from_world, sources.seen)
     matchable = min(sources.num_keypoints, visible)
     sighted = np.repeat(inliers, sources.support)
-    angles, ratios = _viewpoints(points, center, sources, inliers, sighted)
+    seen = np.repeat(points, sources.support[inliers], axis=0)
+    angles, ratios = _viewpoints(center - seen, sources.centers[sighted] - seen)
     images = np.unique(sources.images[sighted], return_counts=True)[1]
     share = max(visible, count) / _MIN_VISIBLE
     return {
@@ -103,7 +104,7 @@ def evidence_of(
         "agreement": math.log(count / (num - count + 1.0)),
         "matched_share": math.log(count / max(matchable, count)),
         "residual": math.log(max(float(np.median(errors_px[inliers])), 0.1) / max_error_px),
-        "misfit": _misfit(problem, errors_px, pose, inliers, sources),
+        "misfit": _misfit(problem, errors_px, pose, sources),
         "deviation": math.log(
             max(center_deviation(pose.covariance) / float(np.median(distances)), 1e-5)
         ),
@@ -191,13 +192,7 @@ def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> f
     return max(0.0, -float(log_alarms.min()) / math.log(10))
 
 
-def _misfit(
-    problem: PoseProblem,
-    errors_px: Floats,
-    pose: Pose,
-    inliers: NDArray[np.bool_],
-    sources: MatchSources,
-) -> float:
+def _misfit(problem: PoseProblem, errors_px: Floats, pose: Pose, sources: MatchSources) -> float:
     """Return by how much the inliers fit worse than the map's own images, at least 0.
 
     A mirrored or similar scene has hundreds of inliers that almost fit. The ratio is the median of
@@ -215,7 +210,7 @@ def _misfit(
     share = (noise_px / own_px)[:, None] ** 2
     relative = replace(problem, covariances=problem.covariances * share[: len(problem.covariances)])
     _, explained = match_errors(relative, pose.cam_from_world)
-    known = inliers & np.isfinite(own_px)
+    known = pose.inliers & np.isfinite(own_px)
     if known.sum() <= _FEW:
         return 0.0
     ratio = float(np.median((explained / own_px)[known]))
@@ -241,19 +236,12 @@ def _num_visible(
     return int(total)
 
 
-def _viewpoints(
-    points: Floats,
-    center: Floats,
-    sources: MatchSources,
-    inliers: NDArray[np.bool_],
-    sighted: NDArray[np.bool_],
-) -> tuple[float, float]:
+def _viewpoints(ours: Floats, theirs: Floats) -> tuple[float, float]:
     """Return medians over the inliers' map observations.
 
-    They are the viewing angle divided by 90 deg, and |log2| of the distance ratio.
+    They are the viewing angle divided by 90 deg, and |log2| of the distance ratio. ``ours`` and
+    ``theirs`` (N, 3) lead from the points to the query's camera and to those of the map's images.
     """
-    seen = np.repeat(points, sources.support[inliers], axis=0)
-    ours, theirs = center - seen, sources.centers[sighted] - seen
     length, other = np.linalg.norm(ours, axis=1), np.linalg.norm(theirs, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         cosines = np.clip((ours * theirs).sum(axis=1) / (length * other), -1.0, 1.0)
