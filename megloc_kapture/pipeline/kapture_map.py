@@ -228,11 +228,9 @@ class KaptureMap:
     @cached_property
     def global_types(self) -> list[str]:
         """Global-feature types that all map images have."""
-        readers = {t: self.folder.global_features(t) for t in self.folder.types("global_features")}
+        readers = map(self.folder.global_features, self.folder.types("global_features"))
         return [
-            name
-            for name, reader in readers.items()
-            if all(image in reader for image in self.images)
+            reader.type_name for reader in readers if all(image in reader for image in self.images)
         ]
 
 
