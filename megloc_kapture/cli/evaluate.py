@@ -32,9 +32,13 @@ from megloc_kapture.io.dataset_tables import (
     tables_of,
 )
 from megloc_kapture.io.output_folders import check_claim, check_new_file, staged_output
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known, dataset_names
-from megloc_kapture.pipeline.submission import (
+from megloc_kapture.pipeline.datasets import (
+    TWIN_PREFIX,
     check_dataset,
+    check_known,
+    dataset_names,
+)
+from megloc_kapture.pipeline.submission import (
     workspace_provenance,
     write_submission,
 )

@@ -38,7 +38,7 @@ from megloc_kapture.errors import (
     suggestion,
 )
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
+from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import files_below
@@ -161,6 +161,24 @@ def check_known(dataset: str) -> None:
         raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
 
 
+def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
+    """Raise OptionError if the side tables are of another dataset, or are required but missing."""
+    check_known(dataset)
+    plain = (KAPTURE, SYNTHETIC)
+    wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
+    if tables is None and wanted not in plain:
+        raise OptionError(
+            f"the rules of {dataset} are missing; give the imported dataset with --data (check), "
+            "or its megloc/ folder with --side-tables (submit)"
+        )
+    official = {name for name in dataset_names() if name not in plain}
+    check_option(
+        wanted == given or wanted in plain and given not in official,
+        f"dataset {dataset} was requested, but {(tables or Path()) / PROTOCOL_FILE} is for "
+        f"dataset {protocol.dataset}",
+    )
+
+
 def choose_dataset(
     name: str,
     root: Path | None,
@@ -175,21 +193,19 @@ def choose_dataset(
     If ``find_root`` is false, an official dataset may lack a root and then cannot be imported.
     """
     check_known(name)
-    layout = name.removeprefix(TWIN_PREFIX)
+    layout, options = name.removeprefix(TWIN_PREFIX), dict(import_options or {})
     adapter: DatasetAdapter | None = None
     if layout not in (KAPTURE, SYNTHETIC):
-        adapter = load_plugin(DATASETS, layout, dict(import_options or {}))
+        adapter = load_plugin(DATASETS, layout, options)
         check_option(not query_prefix, "--query-prefix is for datasets of kapture folders")
-    elif import_options:
-        raise OptionError(f"dataset {name} has no import options: {', '.join(import_options)}")
-    choice = DatasetChoice(
-        name, root, adapter, dict(import_options or {}), None, query_prefix, allow_missing
-    )
+    elif options:
+        raise OptionError(f"dataset {name} has no import options: {', '.join(options)}")
+    twin = None
     if root is None and (name == SYNTHETIC or name.startswith(TWIN_PREFIX)):
-        return replace(choice, twin=twin_of(layout))
-    if root is None and (find_root or adapter is None):
-        choice = replace(choice, root=_root_in_environment(name, adapter))
-    return choice
+        twin = twin_of(layout)
+    elif root is None and (find_root or adapter is None):
+        root = _root_in_environment(name, adapter)
+    return DatasetChoice(name, root, adapter, options, twin, query_prefix, allow_missing)
 
 
 def with_model(choice: DatasetChoice) -> DatasetChoice | None:
@@ -308,16 +324,15 @@ class BenchmarkFile(PresetOptions):
 
 
 def find_benchmark(dataset: str) -> BenchmarkFile:
-    """Return the packaged benchmark file of a dataset, or of a twin's original, or defaults."""
-    for name in (dataset, dataset.removeprefix(TWIN_PREFIX)):
-        for place in _PLACES:
-            path = place / f"{name}.toml"
-            if path.is_file():
-                benchmark = read_benchmark(path)
-                if name == dataset:
-                    return benchmark
-                return benchmark.model_copy(update={"dataset": dataset, "published": ()})
-    return BenchmarkFile(dataset=dataset)
+    """Return the packaged benchmark file of a dataset or of a twin's original, or defaults."""
+    original = dataset.removeprefix(TWIN_PREFIX)
+    path = next(filter(Path.is_file, (place / f"{original}.toml" for place in _PLACES)), None)
+    if path is None:
+        return BenchmarkFile(dataset=dataset)
+    benchmark = read_benchmark(path)
+    if original == dataset:
+        return benchmark
+    return benchmark.model_copy(update={"dataset": dataset, "published": ()})
 
 
 def read_benchmark(path: Path) -> BenchmarkFile:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.errors import DataError, OptionError, check_option, require
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation.pose_files import (
     format_mlad_file,
     format_pose_file,
@@ -26,9 +26,7 @@ from megloc_kapture.evaluation.pose_files import (
 )
 from megloc_kapture.io.dataset_tables import (
     NO_TABLES,
-    PROTOCOL_FILE,
     RELOCALIZATION_FILE,
-    Protocol,
     SideTables,
     read_side_tables,
     read_unreadable,
@@ -36,13 +34,6 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import read_text, safe_join, temporary_name, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import STATUS_FILE, read_status
-from megloc_kapture.pipeline.datasets import (
-    KAPTURE,
-    SYNTHETIC,
-    TWIN_PREFIX,
-    check_known,
-    dataset_names,
-)
 from megloc_kapture.pipeline.plan import Manifest, read_manifests
 from megloc_kapture.stages import scene
 from megloc_kapture.values import LocalizationResult, Pose, RigidTransform
@@ -52,24 +43,6 @@ _log = logging.getLogger(__name__)
 _Content = tuple[Mapping[str, str], Sequence[str], Sequence[tuple[str, str]]]
 _Results = Mapping[str, LocalizationResult]
 """Results by image, with the submitted poses, including fallbacks."""
-
-
-def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
-    """Raise OptionError if the side tables are of another dataset, or are required but missing."""
-    check_known(dataset)
-    plain = (KAPTURE, SYNTHETIC)
-    wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
-    if tables is None and wanted not in plain:
-        raise OptionError(
-            f"the rules of {dataset} are missing; give the imported dataset with --data (check), "
-            "or its megloc/ folder with --side-tables (submit)"
-        )
-    official = {name for name in dataset_names() if name not in plain}
-    check_option(
-        wanted == given or wanted in plain and given not in official,
-        f"dataset {dataset} was requested, but {(tables or Path()) / PROTOCOL_FILE} is for "
-        f"dataset {protocol.dataset}",
-    )
 
 
 def write_submission(

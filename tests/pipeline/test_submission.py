@@ -32,11 +32,10 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import write_json_model
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.tables import write_status
-from megloc_kapture.pipeline.datasets import DatasetChoice
+from megloc_kapture.pipeline.datasets import DatasetChoice, check_dataset
 from megloc_kapture.pipeline.evaluation_plan import Run
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.submission import (
-    check_dataset,
     keep_submission,
     workspace_provenance,
     write_submission,
