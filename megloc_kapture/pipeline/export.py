@@ -259,7 +259,8 @@ def export(
     check_option(
         not undistort or name == "colmap", f"--undistort is an option of colmap, not of {name}"
     )
-    images, points = _read(map, query, sensor, trajectory=name == "tum")
+    only_queries = name == "tum" and query is not None
+    images, points = _read(None if only_queries else map, query, sensor)
     require(images, "no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
@@ -292,23 +293,15 @@ def _hint_at_undistort(images: Sequence[ExportedImage]) -> None:
 
 
 def _read(
-    given: KaptureMap | Path | str | None,
-    query: Path | str | None,
-    sensor: str | None,
-    *,
-    trajectory: bool,
+    given: KaptureMap | Path | str | None, query: Path | str | None, sensor: str | None
 ) -> tuple[list[ExportedImage], Points]:
-    opened: KaptureMap | None = None
+    opened = given if isinstance(given, KaptureMap) else None
     images: list[ExportedImage] = []
-    if given is not None and not (trajectory and query is not None):
-        if isinstance(given, KaptureMap):
-            opened = given
-        elif (folder := KaptureFolder(kapture_of(given))).has_points():
+    if given is not None:
+        folder = KaptureFolder(kapture_of(given)) if opened is None else opened.folder
+        if opened is None and folder.has_points():
             opened = KaptureMap.open(folder.root)
-        else:
-            images += _posed_images(folder, None, sensor, is_query=False)
-        if opened is not None:
-            images += _posed_images(opened.folder, opened, sensor, is_query=False)
+        images += _posed_images(folder, opened, sensor, is_query=False)
     if query is not None:
         queries = _posed_images(KaptureFolder(query), opened, sensor, is_query=True)
         if not queries:
