@@ -233,17 +233,12 @@ def _insert(stages: list[Stage], stage: Stage) -> None:
         not any(stage.name == other.name for other in stages),
         f"stages.{stage.name}: this stage name is already used",
     )
+    last = -1 if stage.reads else len(stages) - 1
     for path in stage.reads:
-        check_option(
-            any(is_below(path, written) for other in stages for written in other.writes),
-            f"stages.{stage.name} reads {path}, which no stage of the run writes",
-        )
-    places = [
-        number
-        for number, other in enumerate(stages)
-        if any(is_below(path, written) for path in stage.reads for written in other.writes)
-    ]
-    stages.insert(max(places, default=len(stages) - 1) + 1, stage)
+        writers = [at for at, other in enumerate(stages) if is_below(path, *other.writes)]
+        check_option(writers, f"stages.{stage.name} reads {path}, which no stage of the run writes")
+        last = max(last, *writers)
+    stages.insert(last + 1, stage)
 
 
 class Render(Stage):

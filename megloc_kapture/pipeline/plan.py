@@ -324,20 +324,20 @@ def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
     return [
         other.name
         for other in earlier
-        if any(is_below(path, written) for path in stage.reads for written in other.writes)
+        if any(is_below(path, *other.writes) for path in stage.reads)
     ]
 
 
 def _earlier_inputs(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[str, str]:
     """Return fingerprints, by stage, of the inputs that only stages of earlier runs wrote."""
     written = [path for other in stages for path in other.writes]
-    missing = [path for path in stage.reads if not any(is_below(path, other) for other in written)]
+    missing = [path for path in stage.reads if not is_below(path, *written)]
     if not missing:
         return {}
     manifests = read_manifests(workspace.root).values()
     outputs = {}
     for path in missing:
-        made = [m for m in manifests if any(is_below(path, output) for output in m.outputs)]
+        made = [manifest for manifest in manifests if is_below(path, *manifest.outputs)]
         check_option(
             made, f"stage {stage.name} reads {path}, which no stage has written in {workspace.root}"
         )

@@ -114,8 +114,9 @@ ROOT = "root"  # key of the dataset's folder in the inputs of an import stage
 PROTOCOL = "protocol"
 
 
-def is_below(path: str, folder: str) -> bool:
-    return path == folder or path.startswith(f"{folder}/")
+def is_below(path: str, *folders: str) -> bool:
+    """Return whether a path is one of the folders, or below one."""
+    return any(path == folder or path.startswith(f"{folder}/") for folder in folders)
 
 
 class Stage(ABC):
