@@ -16,7 +16,7 @@ from megloc_kapture.io.weights import MissingWeightsError, all_missing, lookup
 from megloc_kapture.mapping.pairs import PairsByPosesOptions
 from megloc_kapture.mapping.uncertainty import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
-from megloc_kapture.plugin_loading import load_plugin, option_fault
+from megloc_kapture.plugin_loading import load_chosen, option_fault
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -266,9 +266,7 @@ def _missing(options: PipelineOptions) -> MissingWeightsError | None:
         *((POSE_REFINERS, plugin) for plugin in options.pose_refinement.by),
     ]
     makers: list[Callable[[], object]] = [
-        partial(load_plugin, group, plugin.name, plugin.options)
-        for group, plugin in chosen
-        if plugin
+        partial(load_chosen, group, plugin) for group, plugin in chosen if plugin
     ]
     makers += [plugin.make for plugin in options.global_features if not plugin.is_vlad]
     missing = []
