@@ -55,7 +55,7 @@ def planned(scene: Path, stages: dict[str, Any]) -> list[Stage]:
 
 
 def expected_counts(workspace: Workspace) -> list[str]:
-    folder = workspace.folder("mapping", "")
+    folder = KaptureFolder(workspace.path("mapping"), features_dirs=[workspace.root])
     keypoints = folder.keypoints("rootsift")
     return [f"{name},{keypoints.length(name)}" for name in folder.read().image_names()]
 

@@ -260,6 +260,11 @@ class _Attempt:
         counted = (len(estimate.inliers), estimate.num_inliers)
         return Pose(estimate.rig_from_world, *counted, candidates=self.cluster, score=score)
 
+    def agrees(self, other: _Attempt) -> bool:
+        if self.frame != other.frame or self.hypothesis is None or other.hypothesis is None:
+            return False
+        return poses_agree(self.hypothesis, other.hypothesis)
+
 
 def _join_agreeing(
     attempts: list[_Attempt],
@@ -269,18 +274,11 @@ def _join_agreeing(
     """Merge attempts with agreeing poses unless that loses inliers; keep the order."""
     groups: list[list[_Attempt]] = []
     for each in attempts:
-        for group in groups:
-            first = group[0]
-            if (
-                each.frame == first.frame
-                and each.hypothesis is not None
-                and first.hypothesis is not None
-                and poses_agree(each.hypothesis, first.hypothesis)
-            ):
-                group.append(each)
-                break
-        else:
+        group = next((group for group in groups if each.agrees(group[0])), None)
+        if group is None:
             groups.append([each])
+        else:
+            group.append(each)
     merged: list[_Attempt] = []
     for group in groups:
         together = group[0]

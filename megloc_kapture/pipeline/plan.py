@@ -28,7 +28,6 @@ from megloc_kapture.io.files import (
     write_json_model,
     writing,
 )
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import claim_folder, release_folder
 from megloc_kapture.stages.stage import (
     CODE_OF,
@@ -74,9 +73,6 @@ class Workspace:
     def partial_path(self, stage: str) -> Path:
         """Return the folder of a stage's unfinished output."""
         return self.root / PARTIAL / stage
-
-    def folder(self, name: str, *features: str) -> KaptureFolder:
-        return KaptureFolder(self.path(name), features_dirs=[self.path(f) for f in features])
 
     @contextmanager
     def lock(self) -> Iterator[None]:

@@ -55,7 +55,7 @@ def both(scene: Path, root: Path, *assignments: str) -> tuple[Workspace, Localiz
 
 def same_poses(workspace: Workspace, localizer: Localizer) -> list[Pose]:
     """Localize the queries from Python and compare with the poses of the workspace."""
-    in_run = workspace.folder("localized").read()
+    in_run = KaptureFolder(workspace.path("localized")).read()
     status = read_status(workspace.path("localized/status.csv"))
     found = dict(Results(localizer, workspace.path("query")))
     assert sorted(found) == in_run.image_names()
@@ -149,7 +149,8 @@ def check_second_matches(workspace: Workspace) -> None:
         assert all(row.matches < first[pair].matches for pair, row in second.items())
         stage = LocalizeQueries(options_of_preset(assignments=[*FEW, *SECOND]))
         folders = stage.query_matches() if kind == "query" else stage.mapping_matches()
-        stored = workspace.folder(kind, *folders).matches(TYPE)
+        places = [workspace.path(folder) for folder in folders]
+        stored = KaptureFolder(workspace.path(kind), features_dirs=places).matches(TYPE)
         for pair, row in {**first, **second}.items():
             assert stored.length(*pair) == row.verified
 
@@ -167,9 +168,9 @@ def test_a_fallback_is_the_pose_of_the_best_reranked_candidate(scene: Path, tmp_
     assert first[0] != first[1]
     Results(localizer, workspace.path("query")).save(tmp_path / "localized")
     found = KaptureFolder(tmp_path / "localized").read().poses()
-    map_poses = workspace.folder("map").read().poses()
+    map_poses = KaptureFolder(workspace.path("map")).read().poses()
     assert found == {name: map_poses[image] for name, image in first[1].items()}
-    assert found == workspace.folder("localized").read().poses()
+    assert found == KaptureFolder(workspace.path("localized")).read().poses()
     # a type that a run does not extract is refused, but not for a map of another tool
     wrong = options_of_preset(assignments=[*sets, "reranking.local_type=superpoint"])
     message = "no local features of type 'superpoint'; known: rootsift"

@@ -76,7 +76,7 @@ def test_modern_maps_smaller_images_and_localizes_whole_ones(
     workspace = evaluated(tmp_path / "workspace", fountain, options)
     # localized queries have their original size
     for folder, width in (("map", 640), ("localized", 1536)):
-        data = workspace.folder(folder).read()
+        data = KaptureFolder(workspace.path(folder)).read()
         assert {data.camera_of(image).width for image in data.image_names()} == {width}
     opened = KaptureMap.open(workspace.path("map"))
     assert opened.pixel_origin.intrinsics == "corner"
