@@ -28,7 +28,23 @@ from megloc_kapture.plugins import (
     PoseHypothesis,
     RankingScene,
 )
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+_Compared = tuple[NDArray[np.uint8], WarpedView]
+
+# inliers of two hypotheses within this radius, as a share of the image's longer side, count as the
+# same; an inlier of n hypotheses counts 1 / n ** _POWER (docs/experiments/clusters.md)
+_RADIUS, _POWER = 0.03, 4.0
+# map images with depth per view; their number bounds the time
+_REFERENCES = 5
+_ANOTHER_VIEW = 0.2  # views that differ by less are near duplicates, see _nearest_first
+_LONG_SIDE_PX = 320  # longer side of the compared views, which are never enlarged
+# clusters with fewer inliers than this share of the largest number are not compared
+_MIN_INLIER_SHARE = 0.05
+_MIN_VALID = 0.15  # smallest share of the query's pixels that must be comparable
+_FINALISTS = 6  # number of clusters that are compared in pairs
 
 
 class InlierCount:
@@ -43,31 +59,14 @@ class InlierCount:
         )
 
 
-class DistinctiveInliersOptions(Options):
-    radius: float = Field(
-        default=0.03,
-        ge=0,
-        description="radius within which inliers of two hypotheses count as the same, as a share "
-        "of the image's longer side",
-    )
-    power: float = Field(
-        default=4.0, gt=0, description="an inlier of n hypotheses counts 1 / n ** power"
-    )
-
-
 class DistinctiveInliers:
     """Plugin ``distinctive``: inliers weighted by how few hypotheses explain them.
 
     Similar rooms all explain the query's walls and furniture. An inlier has the weight ``1 / n **
-    power``, with ``n`` the number of hypotheses that have an inlier within a radius (after the
+    4``, with ``n`` the number of hypotheses that have an inlier within a radius (after the
     geometric bursts of Sattler et al., CVPR 2016). One that explains another's inliers does not
     compete.
     """
-
-    Options = DistinctiveInliersOptions
-
-    def __init__(self, options: DistinctiveInliersOptions | None = None) -> None:
-        self.options = options or DistinctiveInliersOptions()
 
     def score(
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
@@ -77,7 +76,7 @@ class DistinctiveInliers:
         for number in range(len(hypotheses[0].views) if hypotheses else 0):
             views = [hypothesis.views[number] for hypothesis in hypotheses]
             camera = views[0].camera
-            radius_px = max(self.options.radius * max(camera.width, camera.height), 1e-3)
+            radius_px = max(_RADIUS * max(camera.width, camera.height), 1e-3)
             inliers = [view.points_px[view.inliers] for view in views]
             trees = [cKDTree(points) for points in inliers]
             for at, points in enumerate(inliers):
@@ -87,7 +86,7 @@ class DistinctiveInliers:
                         explaining += np.isfinite(
                             tree.query(points, distance_upper_bound=radius_px)[0]
                         )
-                scores[at] += float((explaining**-self.options.power).sum())
+                scores[at] += float((explaining**-_POWER).sum())
         return scores
 
 
@@ -106,52 +105,17 @@ def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
     return 2 * close >= total
 
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-_Compared = tuple[NDArray[np.uint8], WarpedView]
-
-_ANOTHER_VIEW = 0.2  # views that differ by less are near duplicates, see _nearest_first
-
-
 class PerceptualOptions(NetworkOptions):
-    references: int = Field(
-        default=5,
-        ge=1,
-        le=1000,
-        description="number of map images with depth per view: the nearest ones; near duplicates "
-        "only if there are too few others",
-    )
-    long_side: int = Field(
-        default=320, ge=16, description="longer side of the compared views, pixels; never enlarged"
-    )
     distance: PluginChoice = Field(
         default=PluginChoice(name="structure"),
         description="distance of two aligned images: structure, lpips, or a plugin",
-    )
-    min_inlier_share: float = Field(
-        default=0.05,
-        ge=0,
-        le=1,
-        description="clusters with fewer inliers than this share of the largest number are not "
-        "compared",
-    )
-    min_valid: float = Field(
-        default=0.15,
-        ge=0,
-        le=1,
-        description="smallest share of the query's pixels that must be comparable",
-    )
-    finalists: int = Field(
-        default=6,
-        ge=1,
-        description="number of clusters, those with the smallest distance, compared in pairs",
     )
 
 
 class PerceptualRanker:
     """Plugin ``perceptual``: smallest image distance of the query to the view warped to its pose.
 
-    Only clusters with enough inliers take part (``min_inlier_share``). The clusters with the
+    Only clusters with enough inliers take part. The clusters with the
     smallest distances, the finalists, are compared pairwise over the pixels valid in both, since
     distances over different image parts are not comparable; a finalist's score is its mean margin.
     The remaining clusters follow by their distance, then those without depth or with few inliers.
@@ -181,7 +145,7 @@ class PerceptualRanker:
             return np.zeros(len(hypotheses))
         otherwise = DistinctiveInliers().score(hypotheses, scene)
         inliers = [sum(int(v.inliers.sum()) for v in each.views) for each in hypotheses]
-        enough = self.options.min_inlier_share * max(inliers)
+        enough = _MIN_INLIER_SHARE * max(inliers)
         read = cache(scene.query_image), cache(partial(image_with_depth, scene=scene))
         compared = [
             self._views(each, scene, *read) if count >= enough else []
@@ -195,11 +159,11 @@ class PerceptualRanker:
             return otherwise
         by_own = compared_rows[np.argsort(distances[compared_rows], kind="stable")]
         scores = np.full(len(distances), -np.inf)
-        finalists = by_own[: self.options.finalists]
+        finalists = by_own[:_FINALISTS]
         scores[finalists] = self._against_each_other(
             [compared[at] for at in finalists], distances, finalists
         )
-        rest = by_own[self.options.finalists :]
+        rest = by_own[_FINALISTS:]
         scores[rest] = scores[finalists].min() - distances[rest]
         untold = ~np.isfinite(distances)
         scores[untold] = scores[compared_rows].min() - 1.0 - 1.0 / (1.0 + otherwise[untold])
@@ -213,10 +177,10 @@ class PerceptualRanker:
         source_of: Callable[[str], PosedImage | None],
     ) -> list[_Compared]:
         """Return the query image and the map warped into it, at reduced size, for each view."""
-        views, options, images = [], self.options, hypothesis.images
+        views = []
         for view in hypothesis.views:
             place = view.camera, view.cam_from_world
-            warped = aligned_view(*place, images, scene, options, source_of)
+            warped = aligned_view(*place, hypothesis.images, scene, source_of)
             height, width = warped.valid.shape
             mask, valid = scene.query_mask(view.name), warped.valid
             if mask is not None:
@@ -246,7 +210,7 @@ class PerceptualRanker:
     def _mean_distance(self, views: Sequence[_Compared], valid: Sequence[Mask]) -> float:
         """Average over a rig's views, weighted by valid pixels; infinite for too few of them."""
         counts = np.array([int(each.sum()) for each in valid])
-        if counts.sum() < max(1.0, self.options.min_valid * sum(each.size for each in valid)):
+        if counts.sum() < max(1.0, _MIN_VALID * sum(each.size for each in valid)):
             return float("inf")
         distances = [
             self._distance.distance(query, warped.image, mask) if count else np.inf
@@ -263,13 +227,12 @@ def aligned_view(
     cam_from_world: RigidTransform,
     images: Sequence[str],
     scene: RankingScene,
-    options: PerceptualOptions,
     source_of: Callable[[str], PosedImage | None],
 ) -> WarpedView:
     """Warp the map images with depth that are nearest to a pose into its view, at reduced size."""
     found = filter(None, map(source_of, _nearest_first(images, cam_from_world, scene)))
-    sources = list(islice(found, options.references))
-    scale = min(1.0, options.long_side / max(camera.width, camera.height))
+    sources = list(islice(found, _REFERENCES))
+    scale = min(1.0, _LONG_SIDE_PX / max(camera.width, camera.height))
     return warp_to_view(sources, camera, cam_from_world, scale=scale)
 
 

@@ -10,15 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import focal_px, project
 from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
 from megloc_kapture.plugins import RankingScene
-from megloc_kapture.values import Camera, Options, Pose, RigidTransform
+from megloc_kapture.values import Camera, Pose, RigidTransform
 
 _NOISE_VARIANCE = 9.0  # the constant c, grey levels squared: smaller variance counts as noise
+_WINDOW = 0.02  # standard deviation of the windows, as a share of the image's longer side
 _MIN_FILLED = 0.5  # smallest valid share of a window
 # half side of a point's patch and radius of the search for it, in pixels of the query image
 _HALF_PATCH_PX, _SEARCH_PX = 12, 6
@@ -32,29 +32,12 @@ _MAX_SCALE = 2.0
 Float32 = NDArray[np.float32]
 
 
-class StructureOptions(Options):
-    """Options of the image distance ``structure``."""
-
-    window: float = Field(
-        default=0.02,
-        gt=0,
-        le=0.5,
-        description="standard deviation of the Gaussian windows, as a share of the image's longer "
-        "side",
-    )
-
-
 class StructureDistance:
     """Plugin ``structure``: one minus the local correlation of two images' brightness.
 
     SSIM's structure term (Wang et al., IEEE TIP 2004, eq. 10), ``(cov + c) / (s_a s_b + c)`` in
     Gaussian windows over valid pixels. Differences in exposure and shading have little effect.
     """
-
-    Options = StructureOptions
-
-    def __init__(self, options: StructureOptions | None = None) -> None:
-        self.options = options or StructureOptions()
 
     def distance(
         self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
@@ -63,7 +46,7 @@ class StructureDistance:
 
         Infinite if no window is at least half valid.
         """
-        sigma = self.options.window * max(valid.shape)
+        sigma = _WINDOW * max(valid.shape)
         weight = valid.astype(np.float32)
 
         def blurred(values: Float32) -> Float32:

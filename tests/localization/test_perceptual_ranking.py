@@ -13,10 +13,10 @@ from scenes import Scene
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.warping import WarpedView, image_with_depth
+from megloc_kapture.localization import ranking
 from megloc_kapture.localization.ranking import (
     DistinctiveInliers,
     InlierCount,
-    PerceptualOptions,
     PerceptualRanker,
     aligned_view,
 )
@@ -93,10 +93,6 @@ def hypothesis(room: int, inliers: int, views: int = 1) -> PoseHypothesis:
     return PoseHypothesis((f"{room}_0.jpg", f"{room}_1.jpg"), (posed,) * views, 4.0)
 
 
-def ranker(**options: object) -> PerceptualRanker:
-    return PerceptualRanker(PerceptualRanker.Options.model_validate(options))
-
-
 HYPOTHESES = [hypothesis(0, 300), hypothesis(1, 280), hypothesis(RIGHT, 120), hypothesis(3, 200)]
 
 
@@ -106,29 +102,32 @@ def scene() -> Scene:
 
 
 def test_the_room_that_looks_like_the_query_wins(scene: Scene) -> None:
+    assert isinstance(PerceptualRanker(), PoseRanker)
     assert np.argmax(InlierCount().score(HYPOTHESES, scene)) == 0
     assert np.argmax(DistinctiveInliers().score(HYPOTHESES, scene)) == 0
-    scores = ranker().score(HYPOTHESES, scene)
+    scores = PerceptualRanker().score(HYPOTHESES, scene)
     assert scores.shape == (4,) and np.isfinite(scores).all()
     assert np.argmax(scores) == 2
     assert scores[2] - np.delete(scores, 2).max() > 0.05
     assert len(scene.asked) == len(set(scene.asked)) == 1 + 8  # every picture is read once
-    again = pickle.loads(pickle.dumps(ranker()))
+    again = pickle.loads(pickle.dumps(PerceptualRanker()))
     np.testing.assert_array_equal(again.score(HYPOTHESES, scene), scores)
     # the views of a rig count together
     both, alone = (
-        ranker().score([hypothesis(0, 300, views), hypothesis(RIGHT, 120, views)], scene)
+        PerceptualRanker().score([hypothesis(0, 300, views), hypothesis(RIGHT, 120, views)], scene)
         for views in (2, 1)
     )
     np.testing.assert_allclose(both, alone, atol=1e-9)
     # one hypothesis or none
     scene.asked.clear()
-    assert ranker().score([], scene).shape == (0,)
-    np.testing.assert_array_equal(ranker().score(HYPOTHESES[:1], scene), [0.0])
+    assert PerceptualRanker().score([], scene).shape == (0,)
+    np.testing.assert_array_equal(PerceptualRanker().score(HYPOTHESES[:1], scene), [0.0])
     assert scene.asked == []
 
 
-def test_rooms_are_compared_on_their_common_pixels(scene: Scene) -> None:
+def test_rooms_are_compared_on_their_common_pixels(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # only the part that all rooms share is known of a wrong room
     narrow = PoseHypothesis(("0_0.jpg",), HYPOTHESES[0].views, 4.0)
     hide_depth(scene, "0_0.jpg", slice(60, None))
@@ -141,13 +140,17 @@ def test_rooms_are_compared_on_their_common_pixels(scene: Scene) -> None:
     query[:, 100:] = right // 2 + more
     scene.images["q"] = query
     pair = [narrow, hypothesis(RIGHT, 120)]
-    alone = ranker(finalists=1).score(pair, scene)
-    together = ranker().score(pair, scene)
+    together = PerceptualRanker().score(pair, scene)
+    monkeypatch.setattr(ranking, "_FINALISTS", 1)
+    alone = PerceptualRanker().score(pair, scene)
     assert alone[0] > alone[1] + 0.05
     assert abs(together[0] - together[1]) < 0.3 * (alone[0] - alone[1])
 
 
-def test_rooms_without_common_pixels_compare_their_distances(scene: Scene) -> None:
+def test_rooms_without_common_pixels_compare_their_distances(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ranking, "_MIN_VALID", 0.05)
     # the poster of the wrong room and the wall of the right one are known
     for room, unknown in ((0, slice(90)), (RIGHT, slice(70, None))):
         for number in (0, 1):
@@ -155,71 +158,77 @@ def test_rooms_without_common_pixels_compare_their_distances(scene: Scene) -> No
     for order in (1, -1):
         pair = [hypothesis(0, 300), hypothesis(RIGHT, 120)][::order]
         for hypotheses in (pair, [PoseHypothesis(h.images[:1], h.views, 4.0) for h in pair]):
-            scores = ranker(min_valid=0.05).score(hypotheses, scene)[::order]
+            scores = PerceptualRanker().score(hypotheses, scene)[::order]
             assert scores[1] > scores[0] + 0.05
             assert scores.sum() == pytest.approx(0.0)
 
 
-def test_poses_without_depth_or_pixels(scene: Scene) -> None:
+def test_poses_without_depth_or_pixels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     # clusters with few inliers are skipped
-    scores = ranker(min_inlier_share=0.5).score(HYPOTHESES, scene)
+    with monkeypatch.context() as changed:
+        changed.setattr(ranking, "_MIN_INLIER_SHARE", 0.5)
+        scores = PerceptualRanker().score(HYPOTHESES, scene)
     assert np.argmin(scores) == 2  # 120 of 300
     assert not any(name.startswith("2_") for name in scene.asked)
     # hypotheses without depth come last
     depths = scene.depths
     scene.depths = {name: view for name, view in depths.items() if name[0] != "3"}
-    scores = ranker().score(HYPOTHESES, scene)
+    scores = PerceptualRanker().score(HYPOTHESES, scene)
     assert np.argmax(scores) == 2 and np.argmin(scores) == 3
     assert np.isfinite(scores).all()
     # inliers decide if the best by inliers has no depth, or the query is masked
     expected = DistinctiveInliers().score(HYPOTHESES, scene)
     scene.depths = {name: view for name, view in depths.items() if name[0] != "0"}
-    np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
+    np.testing.assert_array_equal(PerceptualRanker().score(HYPOTHESES, scene), expected)
     scene.depths = depths
     scene.masks["q"] = np.zeros((CAMERA.height, CAMERA.width), bool)
-    np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
+    np.testing.assert_array_equal(PerceptualRanker().score(HYPOTHESES, scene), expected)
 
 
 def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
-    plain = ranker().score(HYPOTHESES, scene)
+    plain = PerceptualRanker().score(HYPOTHESES, scene)
     # a person hides the right part of the view
     scene.images["q"] = scene.images["q"].copy()
     scene.images["q"][:, 125:] = 255 * (np.indices((CAMERA.height, 35)).sum(0) % 2)[..., None]
-    spoilt = ranker().score(HYPOTHESES, scene)
+    spoilt = PerceptualRanker().score(HYPOTHESES, scene)
     scene.masks["q"] = np.ones((CAMERA.height, CAMERA.width), bool)
     scene.masks["q"][:, 125:] = False
-    masked = ranker().score(HYPOTHESES, scene)
+    masked = PerceptualRanker().score(HYPOTHESES, scene)
     assert np.argmax(masked) == 2
     assert masked[2] - masked[0] > spoilt[2] - spoilt[0]
     assert plain[2] > 0
 
 
-def view_at(pose: RigidTransform, images: list[str], scene: Scene, **options: int) -> WarpedView:
-    source_of = partial(image_with_depth, scene=scene)
-    return aligned_view(CAMERA, pose, images, scene, PerceptualOptions(**options), source_of)
+def view_at(pose: RigidTransform, images: list[str], scene: Scene) -> WarpedView:
+    return aligned_view(CAMERA, pose, images, scene, partial(image_with_depth, scene=scene))
 
 
-def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
+def test_the_nearest_references_with_depth_are_taken(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ranking, "_REFERENCES", 1)
     near = standing(RIGHT, 0.45)
-    view_at(near, ["2_0.jpg", "2_1.jpg"], scene, references=1)
+    view_at(near, ["2_0.jpg", "2_1.jpg"], scene)
     assert scene.asked == ["2_1.jpg"]
     scene.asked = []
     del scene.depths["2_1.jpg"]
-    view_at(near, ["2_0.jpg", "2_1.jpg"], scene, references=1)
+    view_at(near, ["2_0.jpg", "2_1.jpg"], scene)
     assert scene.asked == ["2_0.jpg"]
     assert not view_at(near, [], scene).valid.any()
 
 
-def test_references_from_different_positions_come_first() -> None:
+def test_references_from_different_positions_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ranking, "_REFERENCES", 2)
     # four images from nearly the same position, and another
     numbers = {0: -0.5, 1: -0.499, 2: -0.498, 3: -0.497, 9: 0.9}
     room = scene_of({f"2_{number}.jpg": standing(RIGHT, x, 0.5) for number, x in numbers.items()})
     film = [f"2_{number}.jpg" for number in range(4)]
-    view = view_at(standing(RIGHT), [*film, "2_9.jpg"], room, references=2)
+    view = view_at(standing(RIGHT), [*film, "2_9.jpg"], room)
     assert room.asked == ["2_3.jpg", "2_9.jpg"]
-    of_film = view_at(standing(RIGHT), film, room, references=2)
+    of_film = view_at(standing(RIGHT), film, room)
     assert view.valid.mean() > of_film.valid.mean() + 0.1
     # all are used if the number allows
+    monkeypatch.undo()
     room.asked = []
     view_at(standing(RIGHT), [*film, "2_9.jpg"], room)
     assert room.asked == ["2_3.jpg", "2_9.jpg", "2_2.jpg", "2_1.jpg", "2_0.jpg"]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.localization import ranking
 from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis
 from megloc_kapture.values import Camera, RigidTransform
@@ -70,37 +72,44 @@ def standing(at_x: float, points: NDArray[np.float64]) -> PoseHypothesis:
     return PoseHypothesis((f"room{at_x}",), (seen,), MAX_ERROR_PX)
 
 
-def ranker(**options: float) -> DistinctiveInliers:
-    return DistinctiveInliers(DistinctiveInliers.Options(**options))
+@pytest.fixture
+def exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Count an inlier by the number of hypotheses that have an inlier at the same pixel."""
+    monkeypatch.setattr(ranking, "_RADIUS", 0.0)
+    monkeypatch.setattr(ranking, "_POWER", 1.0)
 
 
-def test_distinctive_inliers_beat_more_common_ones() -> None:
+def test_distinctive_inliers_beat_more_common_ones(
+    monkeypatch: pytest.MonkeyPatch, exact: None
+) -> None:
     walls, poster = room(100), room(10, seed=1)
     right = standing(0.0, np.concatenate([walls[:70], poster]))
     wrong = [standing(7.0 * number, walls) for number in (1, 2, 3)]
     hypotheses = [*wrong, right]
     assert np.argmax(InlierCount().score(hypotheses, NoScene())) == 0
-    scores = ranker(radius=0.0, power=1.0).score(hypotheses, NoScene())
+    scores = DistinctiveInliers().score(hypotheses, NoScene())
     # 70 points are in four rooms, 30 in three; ten in one
     np.testing.assert_allclose(scores, [*[70 / 4 + 30 / 3] * 3, 70 / 4 + 10])
-    assert np.argmax(ranker().score(hypotheses, NoScene())) == 3
+    monkeypatch.undo()
+    assert np.argmax(DistinctiveInliers().score(hypotheses, NoScene())) == 3
 
 
-def test_a_place_counts_where_it_has_an_inlier_nearby() -> None:
+def test_a_place_counts_where_it_has_an_inlier_nearby(
+    monkeypatch: pytest.MonkeyPatch, exact: None
+) -> None:
     walls = room(50)
     nearby = walls + (0.01, 0.0, 0.0)  # 1 to 2 px
     hypotheses = [standing(0.0, walls), standing(7.0, nearby)]
-    exact = ranker(radius=0.0, power=1.0).score(hypotheses, NoScene())
-    near = ranker(radius=0.01, power=1.0).score(hypotheses, NoScene())
-    np.testing.assert_allclose(exact, 50.0)
-    np.testing.assert_allclose(near, 25.0)
-    np.testing.assert_allclose(ranker().score(hypotheses[:1], NoScene()), [50.0])
+    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses, NoScene()), 50.0)
+    monkeypatch.setattr(ranking, "_RADIUS", 0.01)
+    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses, NoScene()), 25.0)
+    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses[:1], NoScene()), [50.0])
 
 
-def test_two_clusters_of_one_place_do_not_count_against_each_other() -> None:
+def test_two_clusters_of_one_place_do_not_count_against_each_other(exact: None) -> None:
     walls, poster = room(40), room(20, seed=1)
     everything = np.concatenate([walls, poster])
     twice = [standing(0.0, everything), standing(0.001, everything)]
     other = standing(7.0, walls)
-    scores = ranker(radius=0.0, power=1.0).score([*twice, other], NoScene())
+    scores = DistinctiveInliers().score([*twice, other], NoScene())
     np.testing.assert_allclose(scores, [40 / 2 + 20, 40 / 2 + 20, 40 / 3])

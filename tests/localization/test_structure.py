@@ -26,13 +26,9 @@ def picture(seed: int, low: int = 50, high: int = 200) -> Image:
     return cv2.resize(coarse, (80, 60), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
 
 
-def structure(**options: float) -> StructureDistance:
-    return StructureDistance(StructureDistance.Options.model_validate(options))
-
-
-def by_scipy(a: Image, b: Image, valid: NDArray[np.bool_], window: float) -> float:
+def by_scipy(a: Image, b: Image, valid: NDArray[np.bool_]) -> float:
     """Return the distance by scipy's Gaussian windows."""
-    sigma = window * 80
+    sigma = 0.02 * 80
     reach = (round(sigma * 8 + 1) | 1) // 2  # OpenCV's choice of a kernel for floats
 
     def blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -54,9 +50,9 @@ def test_the_distance_is_the_mean_over_windows() -> None:
     valid = FULL.copy()
     valid[:25, 30:] = False
     valid[40:, 5] = False
-    expected = by_scipy(picture(0), picture(1), valid, 0.05)
+    expected = by_scipy(picture(0), picture(1), valid)
     assert 0.3 < expected < 1.7
-    result = structure(window=0.05).distance(picture(0), picture(1), valid)
+    result = StructureDistance().distance(picture(0), picture(1), valid)
     assert result == pytest.approx(expected, rel=1e-3)
 
 
@@ -65,18 +61,20 @@ def test_invalid_pixels_are_ignored() -> None:
     valid = FULL.copy()
     valid[20:40, 20:60] = False
     changed = np.where(valid[..., None], b, other)
-    assert structure().distance(a, changed, valid) == structure().distance(a, b, valid)
+    assert StructureDistance().distance(a, changed, valid) == StructureDistance().distance(
+        a, b, valid
+    )
     same = np.where(valid[..., None], a, other)
-    assert structure().distance(a, same, valid) == pytest.approx(0.0, abs=1e-4)
-    assert structure().distance(a, same, FULL) > 0.05
+    assert StructureDistance().distance(a, same, valid) == pytest.approx(0.0, abs=1e-4)
+    assert StructureDistance().distance(a, same, FULL) > 0.05
 
 
 def test_the_distance_without_valid_pixels_is_infinite() -> None:
     a, b = picture(0), picture(1)
-    assert structure().distance(a, b, ~FULL) == np.inf
+    assert StructureDistance().distance(a, b, ~FULL) == np.inf
     single = ~FULL
     single[30, 40] = True
-    assert structure().distance(a, b, single) == np.inf
+    assert StructureDistance().distance(a, b, single) == np.inf
 
 
 DEPTH_M = 6.0  # of the wall that the cameras face
