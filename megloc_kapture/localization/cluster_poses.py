@@ -122,8 +122,7 @@ def cluster_candidates(
         else:
             labels = np.zeros(len(names), np.int64)
         clusters += [
-            [members[at] for at in np.flatnonzero(labels == label)]
-            for label in range(int(labels.max()) + 1 if len(labels) else 0)
+            [members[at] for at in np.flatnonzero(labels == label)] for label in np.unique(labels)
         ]
     return [tuple(images[at] for at in cluster) for cluster in sorted(clusters)]
 

@@ -135,7 +135,7 @@ def resolve_conflicts(
     point_ids: NDArray[np.int64],
     similarities: Floats,
     image_rows: NDArray[np.int64],
-    seen_once: NDArray[np.bool_] | None = None,
+    seen_once: NDArray[np.bool_],
 ) -> Correspondences:
     """Select one point per keypoint and one keypoint per point from conflicting matches (M,).
 
@@ -150,10 +150,7 @@ def resolve_conflicts(
     best = np.maximum.reduceat(similarities[order], first)
     support = np.diff(first, append=len(order))
     keypoints, points = keypoints[first], points[first]
-    worth = [-best, -support]
-    if seen_once is not None:
-        worth.append(seen_once[order][first])
-    ranked = np.lexsort(worth)
+    ranked = np.lexsort((-best, -support, seen_once[order][first]))
     chosen = np.zeros(len(ranked), np.bool_)
     used_keypoints: set[int] = set()
     used_points: set[int] = set()

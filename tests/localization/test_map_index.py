@@ -84,6 +84,7 @@ def resolve(matches: list[tuple[int, int, float, int]]) -> Correspondences:
         np.array(points, dtype=np.int64),
         np.array(similarities, dtype=np.float64),
         np.array(images, dtype=np.int64),
+        np.zeros(len(matches), np.bool_),
     )
 
 
