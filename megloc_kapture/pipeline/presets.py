@@ -62,29 +62,19 @@ _MEGLOC = PipelineOptions(
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
 )
-# all weights have a free licence: docs/experiments/presets.md
+# all weights of the modern presets have a free licence: docs/experiments/presets.md
+_ALIKED = LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05})
+_LIGHTGLUE = PluginChoice(name="lightglue", options={"weights": "aliked_lightglue"})
 _MODERN = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
-    local_features=(
-        LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05}),
-    ),
+    local_features=(_ALIKED,),
     # only weak pairs of map images, so that queries cost no more
-    second_matching=SecondMatchingOptions(
-        matcher=PluginChoice(name="lightglue", options={"weights": "aliked_lightglue"}),
-        min_matches=100,
-        queries=False,
-    ),
+    second_matching=SecondMatchingOptions(matcher=_LIGHTGLUE, min_matches=100, queries=False),
 )
-# all weights have a free licence, and must be downloaded
+# the weights must be downloaded
 _MODERN_LARGE = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
-    local_features=(
-        LocalFeaturesChoice(
-            name="aliked",
-            options={"max_keypoints": 2048, "threshold": 0.05},
-            matching=PluginChoice(name="lightglue", options={"weights": "aliked_lightglue"}),
-        ),
-    ),
+    local_features=(_ALIKED.model_copy(update={"matching": _LIGHTGLUE}),),
     global_features=(GlobalFeaturesChoice(name="megaloc"),),
     reranking=RerankingOptions(by="coverage"),
 )
