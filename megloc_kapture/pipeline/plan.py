@@ -154,12 +154,6 @@ class Workspace:
                 if new.exists():
                     os.rename(new, place)
 
-    def remove(self, outputs: Iterable[str]) -> None:
-        for output in outputs:
-            place = self.root / output
-            with writing(place):
-                remove(place)
-
 
 class Manifest(Options):
     stage: str
@@ -394,8 +388,7 @@ def _run(
         workspace.manifest_path(stage.name).unlink(missing_ok=True)
         _take_over(stage, workspace)
         written = tuple(o for o in stage.writes if (folder / o).exists())
-        workspace.publish(folder, tuple(stage.writes))
-        workspace.remove(_former_outputs(stage, made))
+        workspace.publish(folder, (*stage.writes, *_former_outputs(stage, made)))
     results = {
         "outputs": written,
         "counts": counts,
