@@ -81,12 +81,8 @@ class LocalType:
     def prepare(self) -> None:
         """Extract missing map descriptors again; call this before matching."""
         if lacking := self.first.without_descriptors(self._map.images):
-            try:
-                extractor = self.extractor
-            except DataError as error:
-                about = f"{len(lacking)} map images, such as {lacking[0]}, lack descriptors"
-                raise DataError(f"{about}: {error.message}", path=error.path) from error
-            self._again = extract_again(self._map, self.first, extractor)
+            about = f"{len(lacking)} map images, such as {lacking[0]}, lack descriptors"
+            self._again = extract_again(self._map, self.first, self.required_extractor(about))
 
     @property
     def name(self) -> str:
@@ -118,6 +114,13 @@ class LocalType:
             LOCAL_FEATURES, choice, self._options.placement
         )
         return extractor
+
+    def required_extractor(self, about: str) -> LocalFeatureExtractor:
+        """Return the extractor; DataError that begins with ``about`` if it is not usable."""
+        try:
+            return self.extractor
+        except DataError as error:
+            raise DataError(f"{about}: {error.message}", path=error.path) from error
 
     def brought(self) -> PluginChoice | None:
         stored = self.first.extractor()

@@ -233,7 +233,11 @@ class KaptureQueries(Queries):
     def query(self, name: str) -> Query:
         candidates: tuple[str, ...] | None = None
         try:
-            features = self._features(name)
+            features = {
+                base: _stored_features(stored, name)
+                for base, stored in self._local.items()
+                if name in stored
+            }
             of_image = {
                 t: reader.read(name) for t, reader in self._globals.items() if name in reader
             }
@@ -261,13 +265,6 @@ class KaptureQueries(Queries):
             prior = tuple(images[position] for position in permitted)
             prior_of.update(dict.fromkeys((self.names[at] for at in positions), prior))
         return prior_of
-
-    def _features(self, name: str) -> dict[str, LocalFeatures]:
-        return {
-            base: _stored_features(stored, name)
-            for base, stored in self._local.items()
-            if name in stored
-        }
 
 
 def _stored_features(stored: MapKeypoints, image: str) -> LocalFeatures:

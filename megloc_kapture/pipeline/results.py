@@ -60,7 +60,9 @@ class Results(Mapping[str, Pose | Failure]):
             self.queries = KaptureQueries(opened, localizer.map)
         localizer.map.check()
         self.queries.check()
-        self._check_extractors()
+        for local in localizer.types:
+            if (lacking := self.queries.lacking(local.name)) is not None:
+                local.required_extractor(f"image {lacking!r}")
         self._candidates = candidates
         self._units = self.queries.units(rigs=localizer.options.localization.rigs)
         self._found: dict[str, Pose | Failure | None] = {
@@ -131,16 +133,6 @@ class Results(Mapping[str, Pose | Failure]):
                 cameras[name] = data.camera_of(name)
         folder = self.localizer.map.folder
         write_view(path, folder, self, truth, cameras=cameras)
-
-    def _check_extractors(self) -> None:
-        for local in self.localizer.types:
-            lacking = self.queries.lacking(local.name)
-            if lacking is None:
-                continue
-            try:
-                _ = local.extractor
-            except DataError as error:
-                raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error
 
     def _query(self, name: str) -> Query:
         query = self.queries.query(name)
