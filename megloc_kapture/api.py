@@ -256,8 +256,11 @@ def _run(
 ) -> Workspace:
     workspace = Workspace(Path(folder))
     kind: ExecutorKind = "processes" if scheduler is None else "dask"
-    opened = open_executor(kind, workers, scheduler, workspace.root)
-    with workspace.lock(), single_threaded(), opened as executor:
+    with (
+        workspace.lock(),
+        single_threaded(),
+        open_executor(kind, workers, scheduler, workspace.root) as executor,
+    ):
         run_plan(stages, workspace, Work(executor, num_threads=workers))
     return workspace
 

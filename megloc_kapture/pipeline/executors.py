@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Literal
@@ -93,13 +93,12 @@ def end_with_parent() -> None:
     threading.Thread(target=wait_for_parent, daemon=True).start()
 
 
-@contextmanager
 def open_executor(
     kind: ExecutorKind,
     workers: int | None = None,
     scheduler: str | None = None,
     shared: Path | None = None,
-) -> Iterator[Executor | None]:
+) -> AbstractContextManager[Executor | None]:
     """Open the executor of a run, or None for inline work; kill workers on an exception.
 
     With dask, ``scheduler`` is an address (None starts a local cluster) and ``shared`` a folder
@@ -112,13 +111,8 @@ def open_executor(
     if kind == "dask":
         from megloc_kapture.pipeline.dask_executor import dask_executor
 
-        with dask_executor(count, scheduler, shared or Path.cwd()) as cluster:
-            yield cluster
-    elif kind == "inline" or count == 1:
-        yield None
-    else:
-        with _process_pool(count) as pool:
-            yield pool
+        return dask_executor(count, scheduler, shared or Path.cwd())
+    return nullcontext() if kind == "inline" or count == 1 else _process_pool(count)
 
 
 @contextmanager
