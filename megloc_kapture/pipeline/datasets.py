@@ -86,16 +86,13 @@ class DatasetChoice:
 
     def has_query_depth(self) -> bool:
         """Return whether a rig links depth maps to the queries (of kapture folders; else False)."""
-        if self.root is None or self.adapter is not None:
-            return False
-        return _has_depth(self.root / QUERY)
+        return self.root is not None and self.adapter is None and _has_depth(self.root / QUERY)
 
     def has_map_depth(self) -> bool:
-        if self.adapter is not None:
-            return bool(getattr(getattr(self.adapter, "options", None), "depth", False))
-        if self.root is None:
-            return bool(getattr(self.twin and self.twin.options, "depth", False))
-        return _has_depth(self.root / MAPPING)
+        made_by = self.adapter or self.twin
+        if made_by is not None:
+            return bool(getattr(getattr(made_by, "options", None), "depth", False))
+        return self.root is not None and _has_depth(self.root / MAPPING)
 
     def settings(self) -> dict[str, Any]:
         settings: dict[str, Any] = {"dataset": self.name, "query_prefix": self.query_prefix}

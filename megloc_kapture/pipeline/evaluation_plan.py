@@ -138,13 +138,11 @@ def choose_run(
     config : benchmark file that replaces the packaged one.
     find_root : if false, an official dataset may lack a root and then cannot be imported.
     """
-    benchmark = find_benchmark(dataset)
-    if config:
-        benchmark = read_benchmark(config)
-        check_option(
-            benchmark.dataset == dataset,
-            f"{config} is for dataset {benchmark.dataset}, not {dataset}",
-        )
+    benchmark = read_benchmark(config) if config else find_benchmark(dataset)
+    check_option(
+        benchmark.dataset == dataset,
+        f"{config} is for dataset {benchmark.dataset}, not {dataset}",
+    )
     preset = preset or benchmark.preset
     source = choose_dataset(
         dataset,
