@@ -224,7 +224,6 @@ def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
 
 
 ExportFormat = Literal["colmap", "nerfstudio", "tum", "ply"]
-_KIND = "export"
 _NO_ROWS = np.zeros(0, np.int64)
 
 
@@ -265,7 +264,7 @@ def export(
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
         inputs = (map.folder.root if isinstance(map, KaptureMap) else map, query)
-        with staged_output(output, kind=_KIND, force=force, inputs=inputs) as out:
+        with staged_output(output, kind="export", force=force, inputs=inputs) as out:
             if undistort:
                 export_undistorted(images, points, out)
             elif name == "colmap":
@@ -295,12 +294,14 @@ def _hint_at_undistort(images: Sequence[ExportedImage]) -> None:
 def _read(
     given: KaptureMap | Path | str | None, query: Path | str | None, sensor: str | None
 ) -> tuple[list[ExportedImage], Points]:
-    opened = given if isinstance(given, KaptureMap) else None
+    opened: KaptureMap | None = None
     images: list[ExportedImage] = []
     if given is not None:
-        folder = KaptureFolder(kapture_of(given)) if opened is None else opened.folder
-        if opened is None and folder.has_points():
-            opened = KaptureMap.open(folder.root)
+        if isinstance(given, KaptureMap):
+            folder, opened = given.folder, given
+        else:
+            folder = KaptureFolder(kapture_of(given))
+            opened = KaptureMap.open(folder.root) if folder.has_points() else None
         images += _posed_images(folder, opened, sensor, is_query=False)
     if query is not None:
         queries = _posed_images(KaptureFolder(query), opened, sensor, is_query=True)

@@ -127,12 +127,11 @@ class Localizer:
 
     def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
         with single_threaded():
-            images = [self.matching.image(query) for query, _ in unit]
             sources = [
-                LiveSource(self.matching, image, cam_from_rig)
-                for image, (_, cam_from_rig) in zip(images, unit, strict=True)
+                LiveSource(self.matching, self.matching.image(query), cam_from_rig)
+                for query, cam_from_rig in unit
             ]
-            by_name = {image.query.name: image for image in images}
+            by_name = {source.image.query.name: source.image for source in sources}
             scene = KaptureScene(self.map.folder, by_name, map_camera=self.map.camera)
             results = localize_query(
                 sources,
@@ -143,8 +142,8 @@ class Localizer:
                 scene=scene,
             )
             finished = []
-            for image, source, result in zip(images, sources, results, strict=True):
-                name = image.query.name
+            for source, result in zip(sources, results, strict=True):
+                image, name = source.image, source.image.query.name
                 if isinstance(result, Pose):
                     intrinsics = result.camera or image.camera
                     result = self.refiners.refine(name, intrinsics, result, scene)

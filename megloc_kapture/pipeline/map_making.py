@@ -275,11 +275,6 @@ _STAMP = "colmap.txt"
 _VERSION = 4  # version of the import; a change rebuilds all maps
 
 
-def colmap_maps_folder() -> Path:
-    """Return the cache folder of imported maps; it may be missing, and users may delete it."""
-    return user_cache() / "maps"
-
-
 def import_colmap(
     source: ColmapFolders, output: Path, *, unit: str = NO_METRES, work: Work = HERE
 ) -> dict[str, float]:
@@ -326,7 +321,7 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     stamp = _stamp(source).encode()
     place = Path(os.path.realpath(source.model))
     digest = hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
-    folder = colmap_maps_folder()
+    folder = user_cache() / "maps"
     kept = folder / f"{place.name[:40]}-{digest}"
     if (kept / _STAMP).is_file() and (kept / _STAMP).read_bytes() == stamp:
         return kept

@@ -24,10 +24,10 @@ from megloc_kapture.io.dataset_tables import (
     write_unreadable,
     write_world,
 )
+from megloc_kapture.io.files import user_cache
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.map_making import (
-    colmap_maps_folder,
     describe_map,
     kapture_of,
     options_of_photographs,
@@ -67,9 +67,9 @@ def test_a_colmap_workspace_is_opened_as_a_map(
     assert np.linalg.norm(found.cam_from_world.center() - truth.center()) < 0.01
     assert state(workspace) == before
     # the map is imported once
-    imported = state(colmap_maps_folder())
+    imported = state(user_cache() / "maps")
     megloc.open_map(workspace)
-    assert state(colmap_maps_folder()) == imported
+    assert state(user_cache() / "maps") == imported
 
 
 def test_a_changed_model_is_imported_again(workspace: Path) -> None:
@@ -85,11 +85,11 @@ def test_a_changed_model_is_imported_again(workspace: Path) -> None:
     link = first / "sensors" / "records_data"
     kapture_of(workspace)
     assert link.resolve() == (workspace / "sparse" / "images").resolve()
-    assert [path.name for path in colmap_maps_folder().iterdir()] == [first.name]
+    assert [path.name for path in (user_cache() / "maps").iterdir()] == [first.name]
 
 
 def test_a_cache_that_cannot_be_written_names_the_setting(workspace: Path) -> None:
-    colmap_maps_folder().parents[1].touch()
+    user_cache().parent.touch()
     with pytest.raises(megloc.OutputError, match="maps: cannot write: .*; XDG_CACHE_HOME sets"):
         kapture_of(workspace)
 
@@ -103,7 +103,7 @@ def test_a_damaged_model_leaves_no_map(
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(megloc.DataError, match=r"points3D.bin: the file is damaged"):
         megloc.open_map(workspace)
-    assert list(colmap_maps_folder().iterdir()) == []
+    assert list((user_cache() / "maps").iterdir()) == []
 
 
 UNREGISTERED = "unregistered.csv"
