@@ -33,7 +33,7 @@ from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
 from megloc_kapture.stages.reranking import RerankingOptions
-from megloc_kapture.values import Options
+from megloc_kapture.values import Options, listed
 
 OptionsT = TypeVar("OptionsT", bound=Options)
 
@@ -190,8 +190,7 @@ def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
         if isinstance(value, dict) and isinstance(present, dict):
             _merge(present, value)
         elif isinstance(value, dict) and isinstance(present, list | tuple | str):
-            several = [present] if isinstance(present, str) else present
-            tree[key] = _merged_choices(key, several, value)
+            tree[key] = _merged_choices(key, listed(present), value)
         else:
             tree[key] = value
 
