@@ -276,10 +276,7 @@ OF_ALL = "all"
 def calibrations() -> Mapping[str, Calibration]:
     """Return the calibrations by prefix of the keypoints type; :data:`OF_ALL` for others."""
     text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
-    return {
-        name: Calibration(table["origin"], table["bias"], table["weights"])
-        for name, table in tomllib.loads(text).items()
-    }
+    return {name: Calibration(**table) for name, table in tomllib.loads(text).items()}
 
 
 def calibration_for(local_types: Collection[str]) -> Calibration:
