@@ -245,21 +245,19 @@ def run_plan(
         planned = _planned(stage, inputs)
         why = asked.get(stage.name) or _why(stage, planned, made, workspace)
         why = "" if number < start else why
-        marks[stage.name] = planned.output
+        state: State
         if made is not None and not why:
-            marks[stage.name] = made.output
-            state: State = "skipped" if number < start else "kept"
-            report = StageReport(stage.name, state, made.seconds, made.counts, "")
+            state, manifest = "skipped" if number < start else "kept", made
         elif dry_run:
             stage.check()
-            report = StageReport(stage.name, "pending", 0.0, {}, why)
+            state, manifest = "pending", planned
         else:
             reason = "starting" if why == _NOT_DONE else why
             say(f"{stage.name}, stage {number + 1} of {stop}: {reason}")
-            manifest = _run(stage, planned, made, workspace, work)
-            report = StageReport(stage.name, "run", manifest.seconds, manifest.counts, why)
-        reports.append(report)
-        say(describe(report))
+            state, manifest = "run", _run(stage, planned, made, workspace, work)
+        marks[stage.name] = manifest.output
+        reports.append(StageReport(stage.name, state, manifest.seconds, manifest.counts, why))
+        say(describe(reports[-1]))
     return reports
 
 
