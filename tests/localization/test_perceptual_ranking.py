@@ -102,7 +102,6 @@ def scene() -> Scene:
 
 
 def test_the_room_that_looks_like_the_query_wins(scene: Scene) -> None:
-    assert isinstance(PerceptualRanker(), PoseRanker)
     assert np.argmax(InlierCount().score(HYPOTHESES, scene)) == 0
     assert np.argmax(DistinctiveInliers().score(HYPOTHESES, scene)) == 0
     scores = PerceptualRanker().score(HYPOTHESES, scene)
