@@ -136,7 +136,7 @@ class Results(Mapping[str, Pose | Failure]):
 
     def _query(self, name: str) -> Query:
         query = self.queries.query(name)
-        if self._candidates is None:
+        if self._candidates is None or name in self.queries.faults:
             return query
         return replace(query, candidates=self._candidates.get(name, ()))
 

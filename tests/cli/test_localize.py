@@ -92,11 +92,16 @@ def test_given_pairs_replace_retrieval(megloc: Any, foreign: Path) -> None:
     ranked = [(image, 1.0 - 0.1 * rank) for rank, image in enumerate(chosen)]
     pairs = [ImagePair(query, *candidate) for query in names[1:] for candidate in ranked]
     write_pairs(foreign / "pairs.txt", pairs)
+    (broken,) = (foreign / "query" / DESCRIPTORS).glob(f"{names[-1]}.*")
+    content = broken.read_bytes()
+    broken.unlink()
+    broken.write_bytes(content[:-1])
     result = foreign / "localized"
     assert megloc(*localize(foreign, result), "--pairs", foreign / "pairs.txt").status == 0
     statuses = read_status(result / "status.csv")
     assert statuses[names[0]].reason == "no map image is a candidate"
-    for name in names[1:]:
+    assert str(broken) in statuses[names[-1]].reason
+    for name in names[1:-1]:
         assert set(statuses[name].candidates) <= set(chosen)
     assert max(len(s.candidates) for s in statuses.values()) > 1
     for first, second in (("q/1.jpg", "0003.jpg"), (names[1], "x.jpg")):
