@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.kapture_folders import fitted_camera, warn_of_scaled
+from megloc_kapture.datasets.kapture_folders import fitted_camera, is_kapture, warn_of_scaled
 from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import REPORT_HTML
@@ -178,7 +178,7 @@ class Map:
         """
         if isinstance(query, str):
             query = Path(query)
-        if isinstance(query, Path) and (query / "sensors" / "sensors.txt").is_file():
+        if isinstance(query, Path) and is_kapture(query):
             query = KaptureFolder(query)
         localizer = self.localizer(refine)
         many: KaptureFolder | Photographs

@@ -26,6 +26,7 @@ from megloc_kapture.datasets.kapture_folders import (
     checked_folders,
     import_kapture_folders,
     input_files,
+    is_kapture,
 )
 from megloc_kapture.datasets.official import OfficialDataset, check_official, write_official
 from megloc_kapture.errors import (
@@ -80,9 +81,7 @@ class DatasetChoice:
 
     def has_truth(self) -> bool:
         """Return False for kapture folders without true poses; others may have them (True)."""
-        if self.root is None or self.adapter is not None:
-            return True
-        return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
+        return self.root is None or self.adapter is not None or is_kapture(self.root / QUERY_GT)
 
     def has_query_depth(self) -> bool:
         """Return whether a rig links depth maps to the queries (of kapture folders; else False)."""

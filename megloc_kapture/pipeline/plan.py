@@ -31,6 +31,7 @@ from megloc_kapture.io.files import (
 from megloc_kapture.io.output_folders import claim_folder, release_folder
 from megloc_kapture.stages.stage import (
     CODE_OF,
+    MAP,
     PROTOCOL,
     ROOT,
     Stage,
@@ -44,13 +45,12 @@ from megloc_kapture.values import Options
 PARTIAL = ".partial"
 LOCK = ".lock"
 MARK = ".fingerprint"  # in the unfinished output folder of a stage that resumes
-_MAP = "map"
 
 
 def map_of_workspace(path: Path) -> Path:
     """Return the kapture map in a workspace; any other path unchanged."""
-    is_workspace = (path / LOCK).is_file() and (path / _MAP).is_dir()
-    return path / _MAP if is_workspace else path
+    is_workspace = (path / LOCK).is_file() and (path / MAP).is_dir()
+    return path / MAP if is_workspace else path
 
 
 class Workspace:

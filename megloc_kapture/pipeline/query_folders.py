@@ -466,7 +466,7 @@ def _images_below(folder: Path) -> list[Path]:
     paths, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
-        written = (here / MARKER).is_file() or (here / "sensors" / "sensors.txt").is_file()
+        written = (here / MARKER).is_file() or is_kapture(here)
         if real in seen or (written and here != folder):  # link loop, or kapture or megloc output
             folders.clear()
             continue

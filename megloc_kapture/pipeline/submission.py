@@ -12,7 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
+from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, is_kapture
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation.pose_files import (
     format_mlad_file,
@@ -115,7 +115,7 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
     localized_data = KaptureFolder(localized).read()
     data = localized_data
     query = None if beside is None else beside / QUERY
-    if query is not None and (query / "sensors" / "sensors.txt").is_file():
+    if query is not None and is_kapture(query):
         # the imported queries have the rig, and all images; a third-party result may lack images
         data = KaptureFolder(query).read()
         strange = set(localized_data.image_names()) - set(data.image_names())
