@@ -51,8 +51,6 @@ Floats = NDArray[np.float64]
 
 
 class AbsolutePoseOptions(Options):
-    """Options of the pose estimation."""
-
     max_error_px: float = Field(
         default=12.0, gt=0, description="largest reprojection error of an inlier"
     )

@@ -15,8 +15,6 @@ from megloc_kapture.nets.runtime import NetworkOptions, image_tensor, inference,
 
 
 class LpipsOptions(NetworkOptions):
-    """Options of LPIPS."""
-
     net: Trunk = Field(default="alex", description="alex, vgg or squeeze")
     trunk: str = Field(
         default="",
