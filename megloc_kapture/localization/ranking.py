@@ -50,9 +50,7 @@ _FINALISTS = 6  # number of clusters that are compared in pairs
 class InlierCount:
     """Plugin ``inliers``: the number of inliers."""
 
-    def score(
-        self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
-    ) -> NDArray[np.float64]:
+    def score(self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene) -> Floats:
         return np.array(
             [sum(int(view.inliers.sum()) for view in each.views) for each in hypotheses],
             dtype=np.float64,
@@ -68,9 +66,7 @@ class DistinctiveInliers:
     compete.
     """
 
-    def score(
-        self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
-    ) -> NDArray[np.float64]:
+    def score(self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene) -> Floats:
         scores = np.zeros(len(hypotheses))
         same = [[poses_agree(a, b) for b in hypotheses] for a in hypotheses]
         for number in range(len(hypotheses[0].views) if hypotheses else 0):
@@ -115,12 +111,11 @@ class PerceptualOptions(NetworkOptions):
 class PerceptualRanker:
     """Plugin ``perceptual``: smallest image distance of the query to the view warped to its pose.
 
-    Only clusters with enough inliers take part. The clusters with the
-    smallest distances, the finalists, are compared pairwise over the pixels valid in both, since
-    distances over different image parts are not comparable; a finalist's score is its mean margin.
-    The remaining clusters follow by their distance, then those without depth or with few inliers.
-    If the cluster that ``distinctive`` ranks first is not compared, the scores of ``distinctive``
-    are returned.
+    Only clusters with enough inliers take part. The clusters with the smallest distances, the
+    finalists, are compared pairwise over the pixels valid in both, since distances over different
+    image parts are not comparable; a finalist's score is its mean margin. The remaining clusters
+    follow by their distance, then those without depth or with few inliers. If the cluster that
+    ``distinctive`` ranks first is not compared, the scores of ``distinctive`` are returned.
     """
 
     Options = PerceptualOptions
@@ -144,8 +139,8 @@ class PerceptualRanker:
         if len(hypotheses) < 2:
             return np.zeros(len(hypotheses))
         otherwise = DistinctiveInliers().score(hypotheses, scene)
-        inliers = [sum(int(v.inliers.sum()) for v in each.views) for each in hypotheses]
-        enough = _MIN_INLIER_SHARE * max(inliers)
+        inliers = InlierCount().score(hypotheses, scene)
+        enough = _MIN_INLIER_SHARE * inliers.max()
         read = cache(scene.query_image), cache(partial(image_with_depth, scene=scene))
         compared = [
             self._views(each, scene, *read) if count >= enough else []
