@@ -89,11 +89,6 @@ class Query:
         )
         return mask
 
-    def read_depth(self) -> DepthView | None:
-        if self.depth is None or isinstance(self.depth, DepthView):
-            return self.depth
-        return self.depth()
-
     def has_image(self) -> bool:
         if isinstance(self.image, str | Path):
             return Path(self.image).is_file()
@@ -153,7 +148,8 @@ class QueryImage(ProcessedFrame):
 
     @property
     def depth(self) -> DepthView | None:
-        return self.query.read_depth()
+        depth = self.query.depth
+        return depth if depth is None or isinstance(depth, DepthView) else depth()
 
     @property
     def feature_mask(self) -> NDArray[np.bool_] | None:
