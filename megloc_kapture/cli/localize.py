@@ -71,8 +71,7 @@ class Localize(ReadingMap, Deciding, Common):
     """Write into a non-empty folder, and localize in an inconsistent map."""
 
     def run(self) -> None:
-        if (self.query is None) == (not self.images):
-            raise OptionError("give either --query (a kapture folder) or --images")
+        self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
         folder: KaptureFolder | Photographs
         if self.query is None:
@@ -122,6 +121,19 @@ class Localize(ReadingMap, Deciding, Common):
         )
         if counts["queries"] and not counts["localized"]:
             self.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
+
+    def _check_queries(self) -> None:
+        if (self.query is None) == (not self.images):
+            raise OptionError("give either --query (a kapture folder) or --images")
+        check_option(
+            self.query is None or (self.camera is None and self.every is None),
+            "--camera and --every are for --images; a kapture folder has cameras",
+        )
+        check_option(
+            self.query is None or not self.query.is_file(),
+            f"--query {self.query}: not a kapture folder; a list of cameras goes to "
+            "--camera, the images to --images",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,7 +32,10 @@ WRONG_ARGUMENTS = {
     "unknown flag": (["eval", "kapture", "--roots", "x"], "Perhaps you meant: --root "),
     "not a number": (["eval", "--workers", "two"], "Error parsing --workers: "),
     "not a choice": (["eval", "-v", "loud"], "invalid choice 'loud'"),
-    "no query": (["localize", "-i", "map"], "give either --query"),
+    "camera of a kapture folder": (
+        ["localize", "-i", "map", "--query", "query", "--every", "2"],
+        "--camera and --every are for --images",
+    ),
     "value out of range": (["serve", "map", "--max-mb", "0"], "--max-mb 0.0: must be positive"),
 }
 
