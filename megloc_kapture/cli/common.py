@@ -216,7 +216,7 @@ class Reading:
 
     def kapture_map(self, root: Path) -> KaptureFolder:
         """Open the kapture folder of a map or workspace."""
-        return self.kapture(map_of_workspace(root))
+        return self.kapture(kapture_map(root).root)
 
 
 @dataclass(frozen=True, kw_only=True)
