@@ -38,7 +38,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.pipeline.evaluation_plan import choose_run, plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import ExecutorKind, open_executor, single_threaded
-from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.map_making import (
     kapture_of,
@@ -58,7 +58,14 @@ from megloc_kapture.stages.matches import match_all
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, MAP, Stage
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose, check_camera
+from megloc_kapture.values import (
+    Camera,
+    Failure,
+    ImageFeatures,
+    PixelOriginChoice,
+    Pose,
+    check_camera,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -41,6 +41,7 @@ MIN_CONFIDENCE = 0.6
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Device of a network: auto (a GPU if available), cpu, cuda, or cuda:N."""
 Precision = Literal["full", "half"]
+PixelOriginChoice = Literal["auto", "corner", "centre"]
 
 
 def listed(value: Any) -> Any:

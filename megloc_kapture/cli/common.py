@@ -30,10 +30,10 @@ from megloc_kapture.pipeline.executors import (
 from megloc_kapture.plugin_loading import AUTO, NetworkOptions
 from megloc_kapture.stages.stage import count_label
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Camera
+from megloc_kapture.values import Camera, PixelOriginChoice
 
 if TYPE_CHECKING:
-    from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
+    from megloc_kapture.pipeline.kapture_map import KaptureMap
     from megloc_kapture.pipeline.plan import Workspace
     from megloc_kapture.stages.options import PipelineOptions
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,7 @@ from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.scene import check_points, index_map, observed_keypoints, with_noise
-from megloc_kapture.values import Camera, RigidTransform
-
-PixelOriginChoice = Literal["auto", "corner", "centre"]
+from megloc_kapture.values import Camera, PixelOriginChoice, RigidTransform
 
 _SAMPLED_IMAGES = 50
 _NETWORKS = ("aliked", "aslfeat", "disk", "r2d2", "superpoint", "xfeat")
