@@ -274,45 +274,34 @@ def link_images(
     With ``below``, the links have this name inside the output's two folders.
     """
     for name in folders:
-        source = Path(source_root).resolve() / "sensors" / name
-        link = Path(output_root) / "sensors" / name / below
+        source = Path(source_root) / "sensors" / name
         if source.exists():
-            with _new_link(link):
-                if link.is_symlink():
-                    link.unlink()
-                link.symlink_to(source.resolve(), target_is_directory=True)
+            link_file(source, Path(output_root) / "sensors" / name / below)
 
 
 def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
     """Link names below ``sensors/records_data`` (``""``: the folder itself) to their targets."""
-    records = Path(output_root) / "sensors" / "records_data"
     for name, target in links.items():
-        link = records / name if name else records
-        with _new_link(link):
-            link.symlink_to(Path(target).resolve(), target_is_directory=True)
+        link_file(target, Path(output_root) / "sensors" / "records_data" / name)
 
 
 def link_file(source: Path, link: Path) -> None:
-    with _new_link(link):
+    """Link a file or folder in place of an older file or link."""
+    with writing(link):
+        link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         link.symlink_to(Path(source).resolve())
 
 
 def hard_link(source: Path, link: Path) -> None:
     """Hard-link a file, or copy it where the file system has no hard links."""
-    with _new_link(link):
+    with writing(link):
+        link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         try:
             os.link(source, link)
         except OSError:  # another file system, or one without hard links
             shutil.copyfile(source, link)
-
-
-@contextlib.contextmanager
-def _new_link(link: Path) -> Iterator[None]:
-    with writing(link):
-        link.parent.mkdir(parents=True, exist_ok=True)
-        yield
 
 
 # --------------------------------------------------------------------------------------- JSON

@@ -99,7 +99,7 @@ def test_a_link_replaces_an_older_link_and_never_a_folder(source: Path, tmp_path
     images = tmp_path / "new" / "sensors" / "records_data"
     images.mkdir(parents=True)
     (images / "b.jpg").write_bytes(b"mine")
-    with pytest.raises(OutputError, match="records_data: cannot write: File exists"):
+    with pytest.raises(OutputError, match="records_data: cannot write: Is a directory"):
         link_images(source, tmp_path / "new")
     assert (images / "b.jpg").read_bytes() == b"mine"
     shutil.rmtree(images)
