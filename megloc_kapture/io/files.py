@@ -37,14 +37,10 @@ def read_text(path: Path | str) -> str:
     """Return the text of a UTF-8 file without its byte order mark; line endings are kept."""
     content = read_content(path)
     try:
-        text = content.decode("utf-8-sig")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise DataError("not a text file in UTF-8", path=path, line=line) from error
-    if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
-        raise DataError("a NUL character in a text file", path=path, line=line)
-    return text
 
 
 @contextlib.contextmanager
