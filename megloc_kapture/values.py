@@ -229,6 +229,11 @@ class RigidTransform:
         translation = self._applied(other.translation)
         return RigidTransform((w / norm, x / norm, y / norm, z / norm), translation)
 
+    def scaled(self, scale: float) -> RigidTransform:
+        """Return the transform between frames whose coordinates are ``scale`` times as large."""
+        x, y, z = (scale * float(value) for value in self.translation)
+        return RigidTransform(self.quat_wxyz, (x, y, z))
+
     def _applied(self, point: tuple[float, float, float]) -> tuple[float, float, float]:
         """Transform one point, bit-identical on every processor (unlike BLAS)."""
         px, py, pz = point

@@ -259,12 +259,7 @@ def relative_pose(
     query_from_world: RigidTransform, reference_from_world: RigidTransform, *, scale: float = 1.0
 ) -> RigidTransform:
     """Return ``query_from_reference``; ``scale`` is metres per unit of the (local) world."""
-    return scaled_pose(query_from_world @ reference_from_world.inverse(), scale)
-
-
-def scaled_pose(pose: RigidTransform, scale: float) -> RigidTransform:
-    x, y, z = (scale * np.array(pose.translation)).tolist()
-    return RigidTransform(pose.quat_wxyz, (x, y, z))
+    return (query_from_world @ reference_from_world.inverse()).scaled(scale)
 
 
 def format_mlad_file(poses: Mapping[tuple[int, int], RigidTransform]) -> str:

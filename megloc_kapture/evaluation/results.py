@@ -312,6 +312,6 @@ def _read_mlad(
                 raise DataError(problem, path=pose_file)
             # the identity marks a missing pose, since the file must have every row
             if pose != RigidTransform.identity():
-                local = pose_files.scaled_pose(pose, 1 / world.official_from_local.scale)
+                local = pose.scaled(1 / world.official_from_local.scale)
                 poses[asked_pair] = local @ references[asked_pair.reference]
     return poses

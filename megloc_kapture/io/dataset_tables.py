@@ -84,8 +84,9 @@ class SimilarityTransform(Options):
         except DataError as error:
             raise ValueError(error.message) from error
 
-    def rotation(self) -> RigidTransform:
-        return RigidTransform(self.quat_wxyz, (0.0, 0.0, 0.0))
+    def rigid(self) -> RigidTransform:
+        """Return the transform without its scale."""
+        return RigidTransform(self.quat_wxyz, self.translation)
 
 
 class World(Options):
@@ -106,20 +107,12 @@ class World(Options):
     def pose_in_official(self, cam_from_local: RigidTransform) -> RigidTransform:
         """Convert ``cam_from_local`` to ``cam_from_official``, with lengths in official units."""
         similarity = self.official_from_local
-        local_from_official = similarity.rotation().inverse()
-        rotation = RigidTransform(cam_from_local.quat_wxyz, (0.0, 0.0, 0.0)) @ local_from_official
-        scaled = similarity.scale * np.array(cam_from_local.translation)
-        t = scaled - rotation.rotation_matrix() @ np.array(similarity.translation)
-        return RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+        return cam_from_local.scaled(similarity.scale) @ similarity.rigid().inverse()
 
     def pose_in_local(self, cam_from_official: RigidTransform) -> RigidTransform:
         """Convert ``cam_from_official`` to ``cam_from_local``; inverts :meth:`pose_in_official`."""
         similarity = self.official_from_local
-        offset = cam_from_official.rotation_matrix() @ np.array(similarity.translation)
-        t = (np.array(cam_from_official.translation) + offset) / similarity.scale
-        rotation = RigidTransform(cam_from_official.quat_wxyz, (0.0, 0.0, 0.0))
-        rotation = rotation @ similarity.rotation()
-        return RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
+        return (cam_from_official @ similarity.rigid()).scaled(1 / similarity.scale)
 
 
 _Limit = Annotated[float, Field(ge=0, allow_inf_nan=False)]

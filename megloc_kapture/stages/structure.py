@@ -210,8 +210,6 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
 
 def _moved(model: Model, scale: float, turned: RigidTransform = _UNTURNED) -> Model:
     """Return the model after the transform ``x -> turned(scale * x)`` of the world."""
-    back, poses = turned.inverse(), {}
-    for name, pose in model.poses.items():
-        x, y, z = (scale * np.array(pose.translation)).tolist()
-        poses[name] = RigidTransform(pose.quat_wxyz, (x, y, z)) @ back
+    back = turned.inverse()
+    poses = {name: pose.scaled(scale) @ back for name, pose in model.poses.items()}
     return replace(model, poses=poses)
