@@ -20,10 +20,11 @@ from megloc_twins.synthetic_kapture import (
     build_world,
     depth_name,
     mapping_data,
+    side_tables_of,
     write_files,
-    write_side_tables,
 )
 
+from megloc_kapture.io.dataset_tables import write_side_tables
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import STATUS_FILE, write_status
@@ -85,7 +86,7 @@ def write_scene(root: Path, scene: Scene) -> None:
     write_sensors(root / "mapping", mapping_data(world))
     write_sensors(root / "query", _with_depth(kapture_records(world.queries, poses=False)))
     write_sensors(root / "query_gt", kapture_records(world.queries))
-    write_side_tables(root / "megloc", world)
+    write_side_tables(root / "megloc", side_tables_of(world))
 
 
 def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:

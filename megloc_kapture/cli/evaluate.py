@@ -28,7 +28,7 @@ from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     Protocol,
     check_tables,
-    read_protocol,
+    read_side_tables,
     tables_of,
 )
 from megloc_kapture.io.output_folders import check_claim, check_new_file, staged_output
@@ -125,7 +125,7 @@ class Submit(Common):
         if self.side_tables is not None:
             check_tables(self.side_tables)
         tables = self.side_tables or tables_of(self.input)
-        rules = Protocol() if tables is None else read_protocol(tables)
+        rules = Protocol() if tables is None else read_side_tables(tables).protocol
         check_dataset(self.dataset, rules, tables=tables)
         if rules.pose_file == "mlad":
             check_claim(self.output, kind="submission", force=self.force)

@@ -15,7 +15,6 @@ from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
     SideTables,
-    read_groups,
     read_nowhere,
     read_side_tables,
     write_nowhere,
@@ -149,7 +148,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
     write_sensors(output / MAPPING, data)
     link_images(mapping.root, output / MAPPING)
     names = set(data.image_names())
-    all_groups = read_groups(_tables_beside(mapping))
+    all_groups = read_side_tables(_tables_beside(mapping)).groups
     groups = {name: group for name, group in all_groups.items() if name in names}
     write_side_tables(output / SIDE_TABLES, SideTables(protocol=Protocol(), groups=groups))
     return {"map_images": len(names), "map_images_with_pose": len(poses)}

@@ -26,7 +26,7 @@ from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     SideTables,
     World,
-    read_groups,
+    read_side_tables,
     write_side_tables,
 )
 from megloc_kapture.io.files import find_near, link_records
@@ -221,7 +221,7 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
 
 def read_ground_truth(
     root: Path, query: KaptureData, world: World
-) -> tuple[KaptureData | None, dict[str, ImageGroup]]:
+) -> tuple[KaptureData | None, Mapping[str, ImageGroup]]:
     """Read true poses (in the local frame) and groups from ``<root>/ground_truth``, if present.
 
     Its ``query/`` is a kapture folder with poses in the official frame and with the image names of
@@ -239,7 +239,7 @@ def read_ground_truth(
         if image in true_poses
     }
     truth = with_poses(query, poses)
-    return truth, read_groups(folder / SIDE_TABLES)
+    return truth, read_side_tables(folder / SIDE_TABLES).groups
 
 
 def with_poses(data: KaptureData, poses: Mapping[tuple[int, str], RigidTransform]) -> KaptureData:

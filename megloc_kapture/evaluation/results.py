@@ -17,13 +17,13 @@ from megloc_kapture.io import tables
 from megloc_kapture.io.colmap_model import read_colmap_model
 from megloc_kapture.io.dataset_tables import (
     METRES,
+    NO_TABLES,
     PROTOCOL_FILE,
     SIDE_TABLES,
     RelocalizationPair,
     SideTables,
     World,
-    read_groups,
-    read_world,
+    read_side_tables,
     unit_of,
 )
 from megloc_kapture.io.files import named
@@ -102,14 +102,14 @@ def side_tables_near(result: Path | str) -> Path | None:
 def context_of(result: Path | str, *, mapping: Path | str | None = None) -> ResultContext:
     """Find the data around a result; ``mapping`` replaces the workspace's map."""
     workspace, folder = workspace_of(result), Path(result)
-    features, candidates, maps, groups = [], [folder], [], {}
+    features, candidates, maps, side_tables = [], [folder], [], NO_TABLES
     if workspace is not None:
         # matches of a guided pyramid replace those of pairs with few matches
         pyramids = [workspace / name for name in (_QUERY_PYRAMID, _MAPPING_PYRAMID)]
         features = [workspace, *filter(Path.is_dir, pyramids), workspace / _QUERY_MATCHES]
         candidates = [workspace / _PREPARED / _QUERY, workspace / _QUERY, folder]
         maps = [workspace / name for name in _MAPS]
-        groups = read_groups(workspace / SIDE_TABLES)
+        side_tables = read_side_tables(workspace / SIDE_TABLES)
     queries = next((path for path in candidates if (path / _SENSORS).is_file()), None)
     map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
     if mapping is not None:
@@ -117,7 +117,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
     return ResultContext(
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
-        frames={image: group.frame for image, group in groups.items() if group.frame},
+        frames={image: g.frame for image, g in side_tables.groups.items() if g.frame},
         refinements=_if_there(_read_refinement, folder / tables.REFINEMENT_FILE) or {},
         consistency=_if_there(tables.read_consistency, folder / tables.CONSISTENCY_FILE) or (),
         unit=unit_of(result),
@@ -267,7 +267,7 @@ def distinct_labels(sources: Sequence[Path]) -> list[str]:
 def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -> Poses:
     """Transform poses of a workspace with another local frame to the truth's frame."""
     side_tables = side_tables_near(result)
-    result_world = world if side_tables is None else read_world(side_tables)
+    result_world = world if side_tables is None else read_side_tables(side_tables).world
     if result_world.official_from_local == world.official_from_local:
         return poses
     return {i: world.pose_in_local(result_world.pose_in_official(p)) for i, p in poses.items()}

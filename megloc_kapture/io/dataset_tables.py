@@ -18,10 +18,10 @@ metres. Without protocol.json, the defaults of :class:`Protocol` hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -270,14 +270,20 @@ def check_tables(folder: Path | str) -> None:
     )
 
 
-def read_side_tables(folder: Path) -> SideTables:
+def read_side_tables(folder: Path | str) -> SideTables:
+    folder = Path(folder)
+    permitted: dict[str, tuple[str, ...]] = {}
+    for query, name in sorted(set(read_records(folder / PRIORS_FILE, _prior, missing_ok=True))):
+        permitted[query] = (*permitted.get(query, ()), name)
+    groups = dict(read_records(folder / GROUPS_FILE, _group, missing_ok=True))
+    pairs = folder / RELOCALIZATION_FILE
     return SideTables(
-        protocol=read_protocol(folder),
-        groups=read_groups(folder),
-        priors=read_priors(folder),
-        names=read_names(folder),
-        relocalization=read_relocalization(folder),
-        world=read_world(folder),
+        protocol=_read_model(folder / PROTOCOL_FILE, Protocol),
+        groups=dict(sorted(groups.items())),
+        priors=permitted,
+        names=dict(read_records(folder / NAMES_FILE, _name, missing_ok=True)),
+        relocalization=read_records(pairs, RelocalizationPair, missing_ok=True),
+        world=_read_model(folder / WORLD_FILE, World),
     )
 
 
@@ -285,49 +291,21 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
     write_protocol(folder, tables.protocol)
     if tables.world != World():
         write_world(folder, tables.world)
-    if tables.groups:
-        write_groups(folder, tables.groups)
-    if tables.priors:
-        write_priors(folder, tables.priors)
-    if tables.names:
-        write_names(folder, tables.names)
-    if tables.relocalization:
-        write_relocalization(folder, tables.relocalization)
-
-
-def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
-    groups = dict(read_records(Path(folder) / GROUPS_FILE, _group, missing_ok=True))
-    return dict(sorted(groups.items()))
-
-
-def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
-    rows = [
+    groups = [
         (image, group.condition, group.frame, group.location, int(group.scored))
-        for image, group in sorted(groups.items())
+        for image, group in sorted(tables.groups.items())
     ]
-    write_csv_table(Path(folder) / GROUPS_FILE, columns_of(_group), rows)
-
-
-def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """Read ``priors.csv``: query -> permitted names, sorted; other queries are unrestricted."""
-    permitted: dict[str, tuple[str, ...]] = {}
-    rows = read_records(Path(folder) / PRIORS_FILE, _prior, missing_ok=True)
-    for query, group in sorted(set(rows)):
-        permitted[query] = (*permitted.get(query, ()), group)
-    return permitted
-
-
-def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
-    rows = sorted({(query, group) for query in priors for group in priors[query]})
-    write_csv_table(Path(folder) / PRIORS_FILE, columns_of(_prior), rows)
-
-
-def read_names(folder: Path | str) -> dict[str, str]:
-    return dict(read_records(Path(folder) / NAMES_FILE, _name, missing_ok=True))
-
-
-def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
-    write_csv_table(Path(folder) / NAMES_FILE, columns_of(_name), names.items())
+    priors = {(query, name) for query, names in tables.priors.items() for name in names}
+    pairs = [(pair.file, pair.reference, pair.query) for pair in tables.relocalization]
+    contents: list[tuple[str, Callable[..., Any], Collection[tuple[object, ...]]]] = [
+        (GROUPS_FILE, _group, groups),
+        (PRIORS_FILE, _prior, sorted(priors)),
+        (NAMES_FILE, _name, tables.names.items()),
+        (RELOCALIZATION_FILE, RelocalizationPair, pairs),
+    ]
+    for name, record, rows in contents:
+        if rows:
+            write_csv_table(Path(folder) / name, columns_of(record), rows)
 
 
 def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
@@ -363,8 +341,7 @@ def write_unit(root: Path, unit: str) -> None:
 
 def unit_of(root: Path | str) -> str:
     """Return the unit of a map, or of results localized in a map: m or :data:`NO_METRES`."""
-    tables = tables_of(root)
-    return METRES if tables is None else read_world(tables).unit
+    return read_tables_of(root).world.unit
 
 
 def keep_unit(source: Path, output: Path) -> None:
@@ -373,36 +350,16 @@ def keep_unit(source: Path, output: Path) -> None:
         write_unit(output, unit)
 
 
-def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
-    path = Path(folder) / RELOCALIZATION_FILE
-    return read_records(path, RelocalizationPair, missing_ok=True)
-
-
-def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]) -> None:
-    rows = ((pair.file, pair.reference, pair.query) for pair in pairs)
-    path = Path(folder) / RELOCALIZATION_FILE
-    write_csv_table(path, columns_of(RelocalizationPair), rows)
-
-
-def read_world(folder: Path | str) -> World:
-    return _read_model(folder, WORLD_FILE, World)
-
-
 def write_world(folder: Path | str, world: World) -> None:
     write_json_model(Path(folder) / WORLD_FILE, world)
 
 
-def read_protocol(folder: Path | str) -> Protocol:
-    return _read_model(folder, PROTOCOL_FILE, Protocol)
-
-
-def _read_model(folder: Path | str, name: str, model: type[ModelT]) -> ModelT:
-    path = Path(folder) / name
-    return read_json_model(path, model) if path.exists() else model()
-
-
 def write_protocol(folder: Path | str, protocol: Protocol) -> None:
     write_json_model(Path(folder) / PROTOCOL_FILE, protocol)
+
+
+def _read_model(path: Path, model: type[ModelT]) -> ModelT:
+    return read_json_model(path, model) if path.exists() else model()
 
 
 def read_nowhere(truth: Path | str) -> tuple[str, ...]:

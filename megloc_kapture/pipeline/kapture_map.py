@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.geometry.cameras import shift_principal_point
-from megloc_kapture.io.dataset_tables import NO_TABLES, SideTables, read_tables_of, unit_of
+from megloc_kapture.io.dataset_tables import NO_TABLES, SideTables, read_tables_of
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.weights import registry
 from megloc_kapture.localization.map_index import MapIndex
@@ -159,10 +159,10 @@ class KaptureMap:
             origin = replace(origin, keypoints="corner")
         return MapKeypoints(self.folder, name, index, origin)
 
-    @cached_property
+    @property
     def unit(self) -> str:
         """Unit of points and poses: ``m``, or ``units`` if the scale is unknown."""
-        return unit_of(self.folder.root)
+        return self.tables.world.unit
 
     @cached_property
     def poses(self) -> dict[str, RigidTransform]:

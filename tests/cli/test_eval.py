@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from aachen_files import write_v1_0
 
-from megloc_kapture.io.dataset_tables import read_protocol
+from megloc_kapture.io.dataset_tables import read_side_tables
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs, write_sensors
 from megloc_kapture.io.tables import read_status
@@ -132,7 +132,7 @@ def test_changed_thresholds_repeat_neither_the_map_nor_the_localization(
     done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5", "--until", "submission")
     assert ran(done.err) == ["import", "submission"]
     assert reasons(done.err)["import"] == "options changed: protocol.thresholds"
-    protocol = read_protocol(workspace / "megloc")
+    protocol = read_side_tables(workspace / "megloc").protocol
     assert (protocol.dataset, protocol.thresholds) == ("kapture", ((0.001, 1.0), (0.5, 5.0)))
 
 

@@ -17,9 +17,9 @@ from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
     RelocalizationPair,
-    write_groups,
+    SideTables,
     write_protocol,
-    write_relocalization,
+    write_side_tables,
 )
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import write_status
@@ -64,9 +64,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_kapture(workspace / "mapping", list(MAPPED), MAPPED)
         write_kapture(workspace / "localized", IMAGES, poses_off(by_m, num_lost))
         write_candidates(workspace / "localized")
-        write_protocol(workspace / "megloc", protocol_of("aachen"))
         groups = {image: ImageGroup(condition=image.split("/")[1]) for image in IMAGES}
-        write_groups(workspace / "megloc", groups)
+        write_side_tables(
+            workspace / "megloc", SideTables(protocol=protocol_of("aachen"), groups=groups)
+        )
     return root
 
 
@@ -155,8 +156,8 @@ def write_relocalization_dataset(root: Path) -> None:
     write_kapture(root / "query", names, {})
     write_kapture(root / "localized", names, {name: poses[name] for name in names[1:]})
     pairs = [RelocalizationPair("a_to_b.txt", "100.png", name) for name in names]
-    write_relocalization(root / "megloc", pairs)
-    write_protocol(root / "megloc", Protocol(dataset="4seasons", pose_file="mlad"))
+    rules = Protocol(dataset="4seasons", pose_file="mlad")
+    write_side_tables(root / "megloc", SideTables(protocol=rules, relocalization=pairs))
 
 
 def test_a_submission_of_relocalization_pairs_is_a_folder(megloc: Any, tmp_path: Path) -> None:

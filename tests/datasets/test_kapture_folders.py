@@ -58,7 +58,7 @@ def test_folders_are_written_with_links_to_the_images_and_without_poses_of_queri
     images = root / "mapping/sensors/records_data"
     assert (out / "mapping/sensors/records_data").readlink() == images
     assert query.image_path("b/q.png").is_file()
-    assert tables.read_protocol(out / "megloc") == tables.Protocol()
+    assert tables.read_side_tables(out / "megloc").protocol == tables.Protocol()
     assert sorted(path.name for path in (out / "megloc").iterdir()) == ["protocol.json"]
 
 
@@ -102,29 +102,30 @@ def test_side_tables_are_imported_with_prefixed_queries(root: Path, tmp_path: Pa
     of_query = tables.ImageGroup(condition="night", scored=False)
     moved = tables.SimilarityTransform(translation=(1.0, 2.0, 3.0))
     world = tables.World(official_from_local=moved)
-    tables.write_groups(given, {"a.png": of_map, "r.png": of_query})
-    tables.write_priors(given, {"r.png": ["a.png"]})
-    tables.write_names(given, {"r.png": "R"})
-    tables.write_relocalization(given, [tables.RelocalizationPair("x.txt", "a.png", "r.png")])
-    tables.write_world(given, world)
     protocol = tables.Protocol(dataset="mine", thresholds=((1.0, 2.0),))
-    tables.write_protocol(given, protocol)
+    listed = tables.SideTables(
+        protocol=protocol,
+        groups={"a.png": of_map, "r.png": of_query},
+        priors={"r.png": ["a.png"]},
+        names={"r.png": "R"},
+        relocalization=[tables.RelocalizationPair("x.txt", "a.png", "r.png")],
+        world=world,
+    )
+    tables.write_side_tables(given, listed)
     import_kapture_folders(root, tmp_path / "out", query_prefix="q")
-    assert tables.read_groups(out) == {"a.png": of_map, "q/r.png": of_query}
-    assert tables.read_priors(out) == {"q/r.png": ("a.png",)}
-    assert tables.read_names(out) == {"q/r.png": "R"}
-    assert tables.read_relocalization(out) == [
-        tables.RelocalizationPair("x.txt", "a.png", "q/r.png")
-    ]
-    assert tables.read_world(out) == world
-    assert tables.read_protocol(out) == protocol
+    imported = tables.read_side_tables(out)
+    assert imported.groups == {"a.png": of_map, "q/r.png": of_query}
+    assert imported.priors == {"q/r.png": ("a.png",)}
+    assert imported.names == {"q/r.png": "R"}
+    assert imported.relocalization == [tables.RelocalizationPair("x.txt", "a.png", "q/r.png")]
+    assert imported.world == world and imported.protocol == protocol
 
 
 def test_equal_names_of_map_and_queries_need_a_prefix(root: Path, tmp_path: Path) -> None:
     write_part(root, "query", ["a.png", "r.png"], poses=False)
     write_part(root, "query_gt", ["a.png", "r.png"], poses=True, images=False)
     night = tables.ImageGroup(condition="night")
-    tables.write_groups(root / "megloc", {"a.png": night})
+    tables.write_side_tables(root / "megloc", tables.SideTables(groups={"a.png": night}))
     out = tmp_path / "out"
     with pytest.raises(DataError, match=r"root: 1 images .* the first is a\.png; .*--query-prefix"):
         import_kapture_folders(root, out)
@@ -135,7 +136,8 @@ def test_equal_names_of_map_and_queries_need_a_prefix(root: Path, tmp_path: Path
     truth = KaptureFolder(out / "query_gt").read()
     assert truth.poses().keys() == {"some/where/a.png", "some/where/r.png"}
     # the table applies to both images of the name
-    assert tables.read_groups(out / "megloc") == {"a.png": night, "some/where/a.png": night}
+    imported = tables.read_side_tables(out / "megloc")
+    assert imported.groups == {"a.png": night, "some/where/a.png": night}
 
 
 def test_a_map_without_poses_or_no_queries_are_refused(root: Path, tmp_path: Path) -> None:
@@ -172,7 +174,7 @@ def test_queries_without_images_are_refused(root: Path, tmp_path: Path) -> None:
 
 def test_the_input_files_are_all_files_that_an_import_reads(root: Path) -> None:
     write_image(root / "query/sensors/masks/r.png.png", np.zeros((6, 8), np.uint8))
-    tables.write_priors(root / "megloc", {"r.png": ["a.png"]})
+    tables.write_side_tables(root / "megloc", tables.SideTables(priors={"r.png": ["a.png"]}))
     read = {path for path in root.rglob("*") if path.is_file()}
     (root / "notes.txt").write_text("no input")
     files = list(input_files(root))
@@ -220,10 +222,11 @@ def test_additional_truth_is_converted_to_the_local_frame(
     assert read_ground_truth(tmp_path, one_camera(["q/1.jpg"]), world) == (None, {})
     truth = tmp_path / "ground_truth"
     write_sensors(truth / "query", one_camera(["q/1.jpg", "q/2.jpg"], POSE))
-    tables.write_groups(truth / "megloc", {"q/1.jpg": tables.ImageGroup(condition="DUC1")})
+    of_truth = {"q/1.jpg": tables.ImageGroup(condition="DUC1")}
+    tables.write_side_tables(truth / "megloc", tables.SideTables(groups=of_truth))
     poses, groups = read_ground_truth(tmp_path, one_camera(["q/0.jpg", "q/1.jpg"]), world)
     assert poses is not None and list(poses.poses()) == ["q/1.jpg"]
-    assert groups == {"q/1.jpg": tables.ImageGroup(condition="DUC1")}
+    assert groups == of_truth
     back = world.pose_in_official(poses.poses()["q/1.jpg"])
     np.testing.assert_allclose(back.center(), POSE.center(), atol=1e-6)
     np.testing.assert_allclose(back.quat_wxyz, POSE.quat_wxyz, atol=1e-12)

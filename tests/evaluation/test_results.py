@@ -31,10 +31,7 @@ from megloc_kapture.io.dataset_tables import (
     SideTables,
     SimilarityTransform,
     World,
-    write_groups,
-    write_names,
-    write_protocol,
-    write_world,
+    write_side_tables,
 )
 from megloc_kapture.io.tables import write_status
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -91,8 +88,7 @@ def test_results_in_other_local_frames(world: Any, tmp_path: Path) -> None:
         )
     )
     for name, official_world in (("one", truth_world), ("two", other_world)):
-        write_world(tmp_path / name / "megloc", official_world)
-        write_protocol(tmp_path / name / "megloc", Protocol())
+        write_side_tables(tmp_path / name / "megloc", SideTables(world=official_world))
     names = list(world.truth)
     official = {n: truth_world.pose_in_official(p) for n, p in world.estimated.items()}
     moved = {n: other_world.pose_in_local(p) for n, p in official.items()}
@@ -120,8 +116,7 @@ def test_truth_in_the_official_frame(
     )
     official_world = World(official_from_local=similarity)
     run, names = tmp_path / "run", list(world.truth)
-    write_world(run / "megloc", official_world)
-    write_protocol(run / "megloc", Protocol())
+    write_side_tables(run / "megloc", SideTables(world=official_world))
     local = write_kapture(run / "query_gt", names, world.truth)
     official = {name: official_world.pose_in_official(pose) for name, pose in world.truth.items()}
     actual = write_kapture(run / "localized", names, world.estimated)
@@ -136,8 +131,8 @@ def test_the_challenges_names_are_read_back(
     world: Any, truth: Path, result: Path, tmp_path: Path
 ) -> None:
     names = {name: f"rear/{number}.png" for number, name in enumerate(sorted(world.truth))}
-    write_protocol(tmp_path / "megloc", protocol_of("robotcar"))
-    write_names(tmp_path / "megloc", names)
+    listed = SideTables(protocol=protocol_of("robotcar"), names=names)
+    write_side_tables(tmp_path / "megloc", listed)
     (tmp_path / "poses.txt").write_text(format_pose_file(world.estimated, names=names))
     rules = benchmark_of(tmp_path / "megloc")
     (actual,) = evaluate_results([tmp_path / "poses.txt"], truth, rules)
@@ -161,8 +156,8 @@ def test_context_of_a_result(tmp_path: Path) -> None:
     alone = context_of(result)
     assert alone.query_images() == ["q.jpg"] and alone.map_poses() == {}
     assert context_of(result, mapping=workspace / "mapping").map_poses() == here
-    write_protocol(workspace / "megloc", Protocol())
-    write_groups(workspace / "megloc", {"m.jpg": ImageGroup(frame="DUC1"), "q.jpg": ImageGroup()})
+    groups = {"m.jpg": ImageGroup(frame="DUC1"), "q.jpg": ImageGroup()}
+    write_side_tables(workspace / "megloc", SideTables(groups=groups))
     assert side_tables_near(workspace / "submissions/poses.txt") == workspace / "megloc"
     around = context_of(workspace / "submissions/poses.txt")
     assert around.query_images() == ["q.jpg", "r.jpg"] and around.map_poses() == here
@@ -184,10 +179,9 @@ def test_statuses_and_side_tables_are_used(
         name: ImageGroup(condition=condition, scored=name != unscored)
         for name, condition in world.conditions.items()
     }
-    write_groups(tmp_path, groups)
     pools = {"any light": ("day", "night")}
     rules = Protocol(thresholds=((0.1, None),), conditions=("night", "day"), pools=pools)
-    write_protocol(tmp_path, rules)
+    write_side_tables(tmp_path, SideTables(protocol=rules, groups=groups))
     evaluation = evaluate(result, truth, side_tables=tmp_path, label="x")
     assert [row.name for row in evaluation.rows] == ["night", "day", "any light", "all"]
     assert evaluation.thresholds == (Threshold(position_m=0.1),)

@@ -24,8 +24,7 @@ from megloc_kapture.evaluation.scoring import evaluate_pairs
 from megloc_kapture.io.dataset_tables import (
     RelocalizationPair,
     SideTables,
-    write_protocol,
-    write_relocalization,
+    write_side_tables,
 )
 from megloc_kapture.values import LocalizationResult, RigidTransform
 
@@ -216,11 +215,11 @@ def test_pose_files_and_folders_have_equal_figures(tmp_path: Path) -> None:
     write_kapture(workspace / "mapping", list(references), references)
     write_kapture(workspace / "query_gt", names, truth)
     write_kapture(workspace / "localized", names, estimated)
-    write_protocol(workspace / "megloc", protocol_of("4seasons"))
     pairs = [
         RelocalizationPair(f"reloc_{name[0]}.txt", f"a/{name[2]}00.png", name) for name in names
     ]
-    write_relocalization(workspace / "megloc", pairs)
+    listed = SideTables(protocol=protocol_of("4seasons"), relocalization=pairs)
+    write_side_tables(workspace / "megloc", listed)
     files.mkdir()
     for file in ("reloc_b.txt", "reloc_c.txt"):
         asked = [(p.reference, p.query) for p in pairs if p.file == file and p.query in estimated]

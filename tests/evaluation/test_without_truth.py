@@ -26,9 +26,7 @@ from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
     SideTables,
-    write_groups,
-    write_names,
-    write_protocol,
+    write_side_tables,
 )
 from megloc_kapture.io.tables import write_status
 from megloc_kapture.values import LocalizationResult, RigidTransform
@@ -150,9 +148,12 @@ def test_from_a_workspace(first: Result, tmp_path: Path) -> None:
     write_kapture(workspace / "localized", [*CONDITIONS, "d/training.jpg"], first.poses)
     write_status(workspace / "localized/status.csv", first.statuses.values())
     tables = workspace / "megloc"
-    write_protocol(tables, protocol_of("aachen"))
-    write_groups(tables, {name: ImageGroup(condition=c) for name, c in CONDITIONS.items()})
-    write_names(tables, {name: name.replace("/", "_") for name in CONDITIONS})
+    listed = SideTables(
+        protocol=protocol_of("aachen"),
+        groups={name: ImageGroup(condition=c) for name, c in CONDITIONS.items()},
+        names={name: name.replace("/", "_") for name in CONDITIONS},
+    )
+    write_side_tables(tables, listed)
     rules = benchmark_of(tables)
     result = results_without_truth([workspace / "localized"], rules)
     assert "visuallocalization.net keeps them" in result.statement

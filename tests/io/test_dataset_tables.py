@@ -18,30 +18,19 @@ from megloc_kapture.io.dataset_tables import (
     SideTables,
     SimilarityTransform,
     World,
-    read_groups,
-    read_names,
-    read_priors,
-    read_protocol,
-    read_relocalization,
     read_side_tables,
-    read_world,
-    write_groups,
-    write_names,
-    write_priors,
-    write_protocol,
-    write_relocalization,
-    write_world,
+    write_side_tables,
 )
 from megloc_kapture.values import RigidTransform
 
 
 def test_absent_files_have_defaults(tmp_path: Path) -> None:
-    assert read_groups(tmp_path) == read_priors(tmp_path) == read_names(tmp_path) == {}
-    assert read_relocalization(tmp_path) == []
-    world, protocol = read_world(tmp_path), read_protocol(tmp_path)
-    assert world == World() and world.unit == "m"
+    tables = read_side_tables(tmp_path)
+    assert tables.groups == tables.priors == tables.names == {} and tables.relocalization == []
+    assert tables.world == World() and tables.world.unit == "m"
     pose = RigidTransform((0.5, 0.5, -0.5, 0.5), (0.1, 0.2, 0.3))
-    assert world.pose_in_official(pose) == pose
+    assert tables.world.pose_in_official(pose) == pose
+    protocol = tables.protocol
     assert protocol.thresholds == ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
     assert protocol.pose_file_names == "full"
 
@@ -51,18 +40,18 @@ def test_groups_and_priors_read_back_sorted_names_and_pairs_in_their_order(tmp_p
         "query/b, c.jpg": ImageGroup(condition="night-rain", frame="DUC1", location="017"),
         "map/a.jpg": ImageGroup(scored=False),
     }
-    write_groups(tmp_path, groups)
-    assert list(read_groups(tmp_path).items()) == sorted(groups.items())
-    write_priors(tmp_path, {"q/2.jpg": ["loc-9", "loc-10"], "q/1.jpg": ["map/7.jpg"]})
-    expected = {"q/1.jpg": ("map/7.jpg",), "q/2.jpg": ("loc-10", "loc-9")}
-    assert list(read_priors(tmp_path).items()) == list(expected.items())
+    priors = {"q/2.jpg": ["loc-9", "loc-10"], "q/1.jpg": ["map/7.jpg"]}
     names = {"rain/rear/2.jpg": "rear/2.png", "dawn/rear/1.jpg": "rear/1.png"}
-    write_names(tmp_path, names)
-    assert list(read_names(tmp_path).items()) == list(names.items())
     pairs = [RelocalizationPair("b.txt", "r/2.png", "q/1.png")] * 2
     pairs.append(RelocalizationPair("a.txt", "r/1.png", "q/1.png"))
-    write_relocalization(tmp_path, pairs)
-    assert read_relocalization(tmp_path) == pairs
+    tables = SideTables(groups=groups, priors=priors, names=names, relocalization=pairs)
+    write_side_tables(tmp_path, tables)
+    read = read_side_tables(tmp_path)
+    assert list(read.groups.items()) == sorted(groups.items())
+    expected = {"q/1.jpg": ("map/7.jpg",), "q/2.jpg": ("loc-10", "loc-9")}
+    assert list(read.priors.items()) == list(expected.items())
+    assert list(read.names.items()) == list(names.items())
+    assert read.relocalization == pairs
 
 
 def test_world_and_protocol_read_back_with_every_digit(tmp_path: Path) -> None:
@@ -70,8 +59,6 @@ def test_world_and_protocol_read_back_with_every_digit(tmp_path: Path) -> None:
         quat_wxyz=(0.5, -0.5, 0.5, 0.5), translation=(4177000.123456789, 0.1, -2e-9), scale=0.96
     )
     world = World(official_from_local=similarity, unit="m")
-    write_world(tmp_path, world)
-    assert read_world(tmp_path) == world
     protocol = Protocol(
         dataset="robotcar",
         thresholds=((0.1, None), (0.25, 2.0)),
@@ -79,8 +66,9 @@ def test_world_and_protocol_read_back_with_every_digit(tmp_path: Path) -> None:
         conditions=("dawn", "night"),
         pools={"day": ("dawn",)},
     )
-    write_protocol(tmp_path, protocol)
-    assert read_protocol(tmp_path) == protocol
+    write_side_tables(tmp_path, SideTables(world=world, protocol=protocol))
+    read = read_side_tables(tmp_path)
+    assert read.world == world and read.protocol == protocol
     written = json.loads((tmp_path / "protocol.json").read_text())["thresholds"]
     assert written == [[0.1, None], [0.25, 2.0]]
 
@@ -131,7 +119,6 @@ def pools(tables: SideTables, queries: list[str]) -> dict[str, list[int]]:
 def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
     everything = {"free": [0, 1, 2, 3]}
     assert pools(NO_TABLES, ["free"]) == pools(read_side_tables(tmp_path), ["free"]) == everything
-    write_groups(tmp_path, GROUPS)
     priors = {
         "by location": ["001/rear"],
         "by frame": ["DUC1"],
@@ -139,7 +126,7 @@ def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
         "by several": ["d.jpg", "001/rear", "a.jpg"],
         "by nothing": ["099/rear"],
     }
-    write_priors(tmp_path, priors)
+    write_side_tables(tmp_path, SideTables(groups=GROUPS, priors=priors))
     frames = [members.tolist() for members in SideTables(groups=GROUPS).frames(IMAGES)]
     assert frames == [[3], [0, 1], [2]]
     assert [members.tolist() for members in NO_TABLES.frames(IMAGES)] == [[0, 1, 2, 3]]

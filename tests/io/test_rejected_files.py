@@ -13,7 +13,7 @@ from PIL import Image
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import read_csv_table
-from megloc_kapture.io.dataset_tables import read_groups, read_names, read_relocalization
+from megloc_kapture.io.dataset_tables import read_side_tables
 from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
@@ -50,9 +50,9 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         "image,reason\nok,\n",
         lambda root: list(read_csv_table(root / "table.csv", ("image", "reason"))),
     ),
-    "groups.csv": ("image,condition,frame,location,scored\n", read_groups),
-    "names.csv": ("image,name\n", read_names),
-    "relocalization.csv": ("file,reference,query\n", read_relocalization),
+    "groups.csv": ("image,condition,frame,location,scored\n", read_side_tables),
+    "names.csv": ("image,name\n", read_side_tables),
+    "relocalization.csv": ("file,reference,query\n", read_side_tables),
 }
 
 

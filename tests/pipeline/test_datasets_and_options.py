@@ -15,7 +15,7 @@ from kapture_forms import aachen_with_kapture
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.errors import DataError, MeglocError, OptionError, PluginError
-from megloc_kapture.io.dataset_tables import Protocol, read_protocol
+from megloc_kapture.io.dataset_tables import Protocol, read_side_tables
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.pipeline.datasets import (
     SUMMARY_FILE,
@@ -108,7 +108,7 @@ def test_an_import_writes_a_summary_and_the_protocol(tmp_path: Path) -> None:
         choice.import_to(root, out)
     counts = replace(choice, allow_missing=True).import_to(root, out)
     assert counts == {"map_images": 3, "queries": 3, "queries_with_truth": 0}
-    assert read_protocol(out / "megloc").dataset == "aachen"
+    assert read_side_tables(out / "megloc").protocol.dataset == "aachen"
     text = (out / SUMMARY_FILE).read_text()
     assert "published: 824, -821" in text and NIGHT[0] in text
 

@@ -21,12 +21,11 @@ from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
     RelocalizationPair,
+    SideTables,
     SimilarityTransform,
     World,
-    write_groups,
-    write_names,
     write_protocol,
-    write_relocalization,
+    write_side_tables,
     write_world,
 )
 from megloc_kapture.io.files import write_json_model
@@ -71,11 +70,14 @@ class Dataset:
             },
         )
         write_sensors(root / "query", self.query)
-        write_protocol(self.tables, Protocol(dataset="robotcar"))
         self.groups = {
             image: ImageGroup(scored="/rear/" in image) for image in self.query.image_names()
         }
-        write_groups(self.tables, self.groups)
+        self.write_tables(groups=self.groups)
+
+    def write_tables(self, **tables: Any) -> None:
+        rules = Protocol(dataset="robotcar")
+        write_side_tables(self.tables, SideTables(protocol=rules, **tables))
 
     def true_pose(self, image: str) -> RigidTransform:
         time, side = self.query.record_of(image)
@@ -144,7 +146,7 @@ def test_the_list_of_names_sets_names_and_order(dataset: Dataset, tmp_path: Path
         "dawn/rear/10.jpg": "rear/10.png",
         "night/rear/30.jpg": "rear/30.png",
     }
-    write_names(dataset.tables, names)
+    dataset.write_tables(names=names)
     dataset.localize(dataset.query.image_names(), {})
     counts, _ = submit(dataset, tmp_path / "poses.txt")
     found = read_pose_file(tmp_path / "poses.txt")
@@ -176,7 +178,7 @@ def test_inconsistent_results_are_refused(dataset: Dataset, tmp_path: Path) -> N
     with pytest.raises(DataError, match="poses cannot be derived from the rig"):
         submit(dataset, place, from_rig=True)
     write_protocol(dataset.tables, Protocol(dataset="robotcar", pose_file_names="basename"))
-    write_groups(dataset.tables, {})
+    (dataset.tables / "groups.csv").unlink()
     with pytest.raises(DataError, match="would both be called '10.jpg'"):
         submit(dataset, place)
     stranger = replace(dataset.query, records_camera={(1, "left"): "other.jpg"})
@@ -234,11 +236,14 @@ def write_drives(root: Path) -> KaptureData:
     write_sensors(root / "mapping", mapping)
     write_sensors(root / "query", replace(localized, trajectories={}))
     write_sensors(root / "localized", localized)
-    write_protocol(root / "megloc", Protocol(dataset="4seasons", pose_file="mlad"))
-    write_world(root / "megloc", World(official_from_local=FAR))
     names = [f"ref/cam0/{t}.png" if n < 4 else f"test/cam0/{t}.png" for n, t in enumerate(STAMPS)]
     rows = [RelocalizationPair("sub/a.txt", names[r], names[q]) for r, q in PAIRS]
-    write_relocalization(root / "megloc", rows)
+    listed = SideTables(
+        protocol=Protocol(dataset="4seasons", pose_file="mlad"),
+        world=World(official_from_local=FAR),
+        relocalization=rows,
+    )
+    write_side_tables(root / "megloc", listed)
     return KaptureData(
         sensors=mapping.sensors,
         rigs={"car": {"cam0": RigidTransform.identity()}},  # kapture's exporter needs rigs

@@ -16,7 +16,7 @@ from scipy.io import savemat
 
 from megloc_kapture.datasets.inloc import COLOURS, POINTS
 from megloc_kapture.datasets.official import GROUND_TRUTH
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, write_groups
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, SideTables, write_side_tables
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
@@ -97,7 +97,7 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
         render_frames(cutouts, mapping, finish, build=build, work=work)
         render_frames(options.world(), queries, finish, build=build, work=work)
         groups = {frame.name: ImageGroup(condition=frame.condition) for frame in queries}
-        write_groups(root / GROUND_TRUTH / SIDE_TABLES, groups)
+        write_side_tables(root / GROUND_TRUTH / SIDE_TABLES, SideTables(groups=groups))
         scans = len(mapping) // (len(YAWS_DEG) * len(PITCHES_DEG))
         return {"floors": len(_FLOORS), "scans": scans} | write_truth(root, mapping, queries)
 

@@ -13,10 +13,8 @@ import numpy as np
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
-    World,
-    write_groups,
-    write_protocol,
-    write_world,
+    SideTables,
+    write_side_tables,
 )
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
@@ -136,7 +134,7 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
         write_sensors(root / "mapping", mapping_data(world))
         write_sensors(root / "query", kapture_records(world.queries, poses=False))
         write_sensors(root / "query_gt", kapture_records(world.queries))
-        write_side_tables(root / "megloc", world)
+        write_side_tables(root / "megloc", side_tables_of(world))
         mapping, queries = len(world.mapping), len(world.queries)
         return {"places": len(world.places), "mapping images": mapping, "query images": queries}
 
@@ -162,15 +160,14 @@ def mapping_data(world: SyntheticWorld) -> KaptureData:
     return data
 
 
-def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
-    """Write the queries' conditions, the thresholds and the world frame."""
+def side_tables_of(world: SyntheticWorld) -> SideTables:
+    """Return the queries' conditions and the names of conditions in reports."""
     groups = {
         frame.name: ImageGroup(condition=frame.condition, location=world.places[frame.place].name)
         for frame in world.queries
     }
-    write_groups(folder, groups)
-    write_protocol(folder, Protocol(dataset="synthetic", conditions=("day", "night")))
-    write_world(folder, World())
+    rules = Protocol(dataset="synthetic", conditions=("day", "night"))
+    return SideTables(protocol=rules, groups=groups)
 
 
 def depth_name(image: str) -> str:

@@ -15,7 +15,7 @@ from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
-from megloc_kapture.io.dataset_tables import read_groups, read_names
+from megloc_kapture.io.dataset_tables import read_side_tables
 from megloc_kapture.io.images import image_size
 
 LAYOUT = "robotcar"
@@ -69,7 +69,7 @@ def test_against_kaptures_importer(
     version, parts = theirs
     options = RobotCarOptions(version=1 if version == "v1" else 2, train_as_map=version == "v2")
     write_official(RobotCar(options).read(root), tmp_path / "out")
-    groups = read_groups(tmp_path / "out/megloc")
+    groups = read_side_tables(tmp_path / "out/megloc").groups
     for role in ("mapping", "query"):
         ours = kapture_from_dir(str(tmp_path / "out" / role))
         own_poses = poses_by_image(ours) if role == "mapping" else {}
@@ -104,10 +104,10 @@ def test_layout_has_the_quirks_of_the_original(root: Path, imported: Callable[[s
     assert all("/rear/" in row.split()[0] and len(row.split()) == 17 for row in train_list)
     # the last moments of the rain are in neither
     assert len(test_list) + len(train_list) == 12 - 2
-    names, groups = (read(imported("robotcar") / "megloc") for read in (read_names, read_groups))
-    assert list(names.values()) == test_list
-    scored = {name for name, group in groups.items() if group.scored}
-    assert len(scored) == 10 and names.keys() < scored
+    tables = read_side_tables(imported("robotcar") / "megloc")
+    assert list(tables.names.values()) == test_list
+    scored = {name for name, group in tables.groups.items() if group.scored}
+    assert len(scored) == 10 and tables.names.keys() < scored
     assert all("/rear/" in name for name in scored)
     for path in root.glob("images/*/*/*.jpg"):
         assert int(path.stem) > 1 << 32

@@ -10,7 +10,7 @@ from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.synthetic_kapture import SyntheticWorld, build_world, depth_name
 from megloc_twins.viewpoints import overlap, support, views_of
 
-from megloc_kapture.io.dataset_tables import read_groups, read_protocol, read_world
+from megloc_kapture.io.dataset_tables import read_side_tables
 from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
@@ -85,13 +85,14 @@ def test_what_is_written_is_the_world(root: Path, world: SyntheticWorld) -> None
     assert len(theirs.records_depth.key_pairs()) == len(ours.records_depth)
     assert len(theirs.trajectories) == len(world.rig_from_world)
     # side tables
-    groups, protocol = read_groups(root / "megloc"), read_protocol(root / "megloc")
+    tables = read_side_tables(root / "megloc")
+    groups, protocol = tables.groups, tables.protocol
     conditions = {frame.name: frame.condition for frame in world.queries}
     assert {name: group.condition for name, group in groups.items()} == conditions
     assert {group.location for group in groups.values()} == {"place0", "place1"}
     assert (protocol.dataset, protocol.conditions) == ("synthetic", ("day", "night"))
     assert protocol.thresholds == ((0.05, 5), (0.25, 2), (0.5, 5), (5, 10))
-    assert read_world(root / "megloc").unit == "m"
+    assert tables.world.unit == "m"
 
 
 def test_depth_and_masks(root: Path, world: SyntheticWorld) -> None:

@@ -36,7 +36,7 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
+from megloc_kapture.io.dataset_tables import read_side_tables
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.values import Camera
@@ -114,13 +114,13 @@ def test_tables_have_the_names_conditions_and_protocol_of_the_challenge(
 ) -> None:
     tables = written(root11, tmp_path / "out") / "megloc"
     # in the order of the lists, day first
-    names = list(read_names(tables).items())
+    names = list(read_side_tables(tables).names.items())
     assert names == [(n, n.split("/")[-1]) for n in (*DAY, *ADDED, *NIGHT)]
-    groups = read_groups(tables)
+    groups = read_side_tables(tables).groups
     conditions = {name: group.condition for name, group in groups.items()}
     assert conditions == dict.fromkeys(DAY, "day") | dict.fromkeys(NIGHT + ADDED, "night")
     assert all(group.scored for group in groups.values())
-    protocol = read_protocol(tables)
+    protocol = read_side_tables(tables).protocol
     assert (protocol.dataset, protocol.conditions) == ("aachen", ("day", "night"))
     assert (protocol.pose_file, protocol.pose_file_names) == ("ltvl", "basename")
     # the pose file is named after the version that is read
@@ -151,7 +151,7 @@ def test_images_keep_their_ids_where_others_are_missing(root11: Path, tmp_path: 
     out = written(root11, tmp_path / "out", allow_missing=True)
     mapping, query = (KaptureFolder(out / part).read() for part in ("mapping", "query"))
     assert mapping.image_names() == sorted({*DATABASE, *SEQUENCE} - gone)
-    assert list(read_names(out / "megloc")) == [DAY[0], DAY[2], NIGHT[0]]
+    assert list(read_side_tables(out / "megloc").names) == [DAY[0], DAY[2], NIGHT[0]]
     assert mapping.record_of("db/3.jpg")[1] == "camera_00009"
     assert query.record_of(DAY[2]) == (100_002, "day_00002")
     assert query.record_of(NIGHT[0]) == (200_001, "night_00001")

@@ -171,7 +171,7 @@ def test_relocalization_files_select_images_and_priors(
     write_official(dataset, tmp_path / "out")
     written = tmp_path / "out/megloc"
     pose_file = Path(name).name
-    assert tables.read_relocalization(written) == [
+    assert tables.read_side_tables(written).relocalization == [
         tables.RelocalizationPair(pose_file, image(day, times[25]), image(snow, B + 5)),
         tables.RelocalizationPair(pose_file, image(day, times[3]), image(snow, B + 5)),
     ]
@@ -180,14 +180,14 @@ def test_relocalization_files_select_images_and_priors(
     assert {n.split("/")[0] for n in dataset.mapping.image_names()} == {day}
     # 20 keyframes around each reference: 5 to 45, and 0 to 23
     near = sorted(image(day, t, c) for t in times[:46] for c in ("cam0", "cam1"))
-    assert tables.read_priors(written) == {
+    assert tables.read_side_tables(written).priors == {
         image(snow, B + 5, "cam0"): tuple(near),
         image(snow, B + 5, "cam1"): tuple(near),
     }
-    groups = tables.read_groups(written)
+    groups = tables.read_side_tables(written).groups
     assert groups[image(snow, B + 5)].scored
     assert not groups[image(snow, B + 5, "cam1")].scored
-    protocol = tables.read_protocol(written)
+    protocol = tables.read_side_tables(written).protocol
     assert protocol.pose_file == "mlad"
     assert protocol.thresholds == ((0.1, None), (0.2, None), (0.5, None))
     assert dataset.query_gt is None

@@ -15,7 +15,7 @@ from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
+from megloc_kapture.io.dataset_tables import read_side_tables
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera
@@ -83,7 +83,7 @@ def test_queries_are_imported_as_stored(downloaded: Path, output: Path) -> None:
     turned = query.read().camera_of(names[1])
     assert (turned.width, turned.height) == (64, 48)
     assert len(query.read().sensors) == 2
-    listed = list(read_names(output / "megloc").items())
+    listed = list(read_side_tables(output / "megloc").names.items())
     assert listed == [(name, name.split("/")[-1]) for name in names]
     for name in names:
         link = query.root / "sensors" / "records_data" / name
@@ -91,13 +91,13 @@ def test_queries_are_imported_as_stored(downloaded: Path, output: Path) -> None:
 
 
 def test_each_floor_is_a_coordinate_frame(output: Path) -> None:
-    mapping, groups = KaptureFolder(output / "mapping"), read_groups(output / "megloc")
+    mapping, groups = KaptureFolder(output / "mapping"), read_side_tables(output / "megloc").groups
     mapping.validate(deep=True)
     for image in mapping.read().image_names():
         floor = image.split("/")[2]
         assert (groups[image].frame, groups[image].location) == (floor, f"{floor}/024")
     assert {groups[i].frame for i in KaptureFolder(output / "query").read().image_names()} == {""}
-    assert read_protocol(output / "megloc").conditions == ("DUC1", "DUC2")
+    assert read_side_tables(output / "megloc").protocol.conditions == ("DUC1", "DUC2")
     assert not (output / "query_gt").exists()
 
 

@@ -22,7 +22,7 @@ from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.datasets.robotcar.images import rig_of_model
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.dataset_tables import read_priors
+from megloc_kapture.io.dataset_tables import read_side_tables
 from megloc_kapture.io.kapture import write_sensors
 from megloc_kapture.pipeline.datasets import choose_dataset
 from megloc_kapture.values import RigidTransform
@@ -233,7 +233,7 @@ def test_both_forms_give_the_same_dataset(
         for camera, pose in theirs.items():
             np.testing.assert_allclose(ours[camera].matrix(), pose.matrix(), rtol=0, atol=1e-12)
     assert_linked(actual, tmp_path / "out", official / "images")
-    name, priors = f"dawn/rear/{ts(12)}.jpg", read_priors(tmp_path / "out/megloc")
+    name, priors = f"dawn/rear/{ts(12)}.jpg", read_side_tables(tmp_path / "out/megloc").priors
     assert priors.get(name, ("002/rear",)) == ("002/rear",)
     assert bool(priors) == options.get("location_prior", True)
 
