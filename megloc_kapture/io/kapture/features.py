@@ -237,18 +237,14 @@ class FeatureReader:
 
     def read(self, image: str) -> NDArray[Any]:
         """Read an image's array, (N, dsize) or (dsize,) for global features; finite, writable."""
-        array = self.read_unchecked(image)
-        if not np.isfinite(array).all():
-            raise DataError("not all values are finite", path=self.where(image))
-        return array.copy()
-
-    def read_unchecked(self, image: str) -> NDArray[Any]:
-        """Read an image's array without a check for infinity and NaN; it is not writable."""
         source, name = self._source(image)
         content = source.read(name)
         rows = self._num_rows(len(content), source, name)
         array = np.frombuffer(content, dtype=self.config.dtype)
-        return array if self.kind == "global_features" else array.reshape(rows, self.config.dsize)
+        if not np.isfinite(array).all():
+            raise DataError("not all values are finite", path=source.where(name))
+        shape = (-1,) if self.kind == "global_features" else (rows, self.config.dsize)
+        return array.reshape(shape).copy()
 
     def where(self, image: str) -> str:
         source, name = self._source(image)
@@ -292,10 +288,8 @@ class KaptureVectors:
         images = self._images[part]
         rows = np.empty((len(images), self.shape[1]), np.float32)
         for row, image in zip(rows, images, strict=True):
-            row[:] = self._reader.read_unchecked(image)
+            row[:] = self._reader.read(image)
         squared = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)
-        for at in np.flatnonzero(~np.isfinite(squared))[:1].tolist():
-            raise DataError("not all values are finite", path=self._reader.where(images[at]))
         scaled = np.flatnonzero((squared > 0) & (np.abs(squared - 1) > _ROUNDING))
         rows[scaled] /= np.sqrt(squared[scaled])[:, None]
         return rows
