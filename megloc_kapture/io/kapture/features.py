@@ -29,7 +29,7 @@ from megloc_kapture.io.files import (
     safe_join,
     write_bytes,
 )
-from megloc_kapture.io.kapture.format import check_columns, check_field, format_table, read_rows
+from megloc_kapture.io.kapture.format import check_columns, format_table, read_rows
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
 ArrayKind = Literal["keypoints", "descriptors", "global_features"]
@@ -334,5 +334,5 @@ class FeatureWriter:
             f"image {image}: {content.shape[-1]} columns, but {self.config.dsize} in the "
             f"{self.kind} of other images",
         )
-        path = safe_join(self._folder, check_field(image) + SUFFIX[self.kind])
+        path = safe_join(self._folder, image + SUFFIX[self.kind])
         write_bytes(path, content.tobytes())

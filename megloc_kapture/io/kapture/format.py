@@ -15,7 +15,7 @@ from itertools import chain
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_relative, has_control_characters, named
+from megloc_kapture.io.files import has_control_characters, named
 from megloc_kapture.io.text_lines import reading_lines
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -195,14 +195,6 @@ def writable_name(name: str) -> str:
     left = len(name) - len(name.lstrip())
     name = "_" * left + middle + "_" * (len(name) - left - len(middle))
     return f"_{name[1:]}" if name.startswith("#") else name
-
-
-def check_field(name: str) -> str:
-    """Return an image name if it is a plain path and a valid CSV field; raise DataError if not."""
-    check_relative(name)
-    if "," in name or name != name.strip():
-        raise DataError(f"image name {name!r} has a comma or an outer space")
-    return name
 
 
 def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, safe_join, write_bytes, writing
 from megloc_kapture.io.kapture.features import SUFFIX, Blobs, feature_folder
-from megloc_kapture.io.kapture.format import check_columns, check_field, format_table, read_rows
+from megloc_kapture.io.kapture.format import check_columns, format_table, read_rows
 from megloc_kapture.io.text_lines import numbers_of
 
 _BETWEEN = ".overlapping/"
@@ -105,8 +105,7 @@ class MatchesWriter:
         rows = np.empty((len(pairs), 3), dtype="<f8")
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
         rows[:, 2] = scores
-        name = _name(check_field(min(a, b)), check_field(max(a, b)))
-        write_bytes(safe_join(self._folder, name), rows.tobytes())
+        write_bytes(safe_join(self._folder, _name(min(a, b), max(a, b))), rows.tobytes())
 
 
 def _name(first: str, second: str) -> str:

@@ -27,7 +27,7 @@ from megloc_kapture.io.files import (
     reading,
     write_bytes,
 )
-from megloc_kapture.io.kapture.format import FORMAT_LINE, check_field, check_version
+from megloc_kapture.io.kapture.format import FORMAT_LINE, check_version
 
 POINTS_HEADERS = {3: "# X, Y, Z", 6: "# X, Y, Z, R, G, B"}
 COVARIANCES_FILE = "reconstruction/point_covariances.npy"
@@ -195,10 +195,6 @@ def _integers(texts: Sequence[str]) -> NDArray[np.int64]:
 
 def write_observations(root: Path, observations: Mapping[str, Observations]) -> None:
     """Write ``reconstruction/observations.txt``, sorted by point, then by type."""
-    for keypoints_type, of_type in observations.items():
-        check_component(keypoints_type)
-        for name in of_type.image_names:
-            check_field(name)
     # merge never compares the texts, because each pair of point and type has a single row
     rows = merge(*(_rows(name, of_type) for name, of_type in sorted(observations.items())))
     with atomic_write(Path(root) / "reconstruction" / "observations.txt") as file:
