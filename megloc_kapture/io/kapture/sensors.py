@@ -95,22 +95,13 @@ def read_sensors(path: Path) -> dict[str, Sensor]:
             sensor_id, name, sensor_type, *params = fields
             if not sensor_id or sensor_id in sensors:
                 raise DataError(f"sensor id {sensor_id!r} is empty or listed twice")
-            sensors[sensor_id] = Sensor(name, sensor_type, tuple(params))
-            check_sensor(sensors[sensor_id])
+            sensor = sensors[sensor_id] = Sensor(name, sensor_type, tuple(params))
+            if sensor_type in CAMERA_SENSOR_TYPES and not sensor.is_unknown:
+                sensor.camera()  # checks the parameters
+            elif sensor_type in CAMERA_SENSOR_TYPES:
+                is_size = len(params) == 3 and all(re.fullmatch("[0-9]+", p) for p in params[1:])
+                require(is_size, f"{UNKNOWN_CAMERA} takes a width and a height in whole pixels")
     return sensors
-
-
-def check_sensor(sensor: Sensor) -> None:
-    """Raise DataError for a camera or depth sensor with invalid intrinsics.
-
-    ``UNKNOWN_CAMERA`` with a valid size is accepted.
-    """
-    if sensor.sensor_type not in CAMERA_SENSOR_TYPES:
-        return
-    if not sensor.is_unknown:
-        sensor.camera()
-    elif len(sensor.params) != 3 or not all(re.fullmatch("[0-9]+", p) for p in sensor.params[1:]):
-        raise DataError(f"{UNKNOWN_CAMERA} takes a width and a height in whole pixels")
 
 
 def read_rigs(path: Path, sensors: Collection[str]) -> dict[str, dict[str, RigidTransform]]:
