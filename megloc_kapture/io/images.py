@@ -282,27 +282,20 @@ def guessed_camera(width: int, height: int) -> Camera:
 
 def is_image(path: Path) -> bool:
     """Return whether a file is an image of a supported format, by its content."""
-    from PIL import Image
-
-    if not path.is_file():
-        return False
     try:
-        with _quiet(), Image.open(path) as image:
+        with _opened(path) as image:
             return image.format in _FORMATS
-    except Exception:
+    except DataError:
         return False
 
 
 def read_photo(path: Path | str) -> Photo:
     path = Path(path)
-    check_image_file(path)
     known = f"cannot be read; {', '.join(WRITABLE_SUFFIXES)} can"
     require(path.suffix.lower() not in UNREAD_SUFFIXES, f"{path.suffix} {known}", path=path)
     with _opened(path) as image:
-        photo = photo_of(image) if image.format in _FORMATS else None
-    if photo is None:
-        raise DataError(f"an image of this format {known}", path=path)
-    return photo
+        require(image.format in _FORMATS, f"an image of this format {known}", path=path)
+        return photo_of(image)
 
 
 def photo_of(image: Image.Image) -> Photo:
