@@ -19,10 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any
-
-from pydantic import AfterValidator, Field, StringConstraints
+from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import (
     DataError,
@@ -35,8 +32,6 @@ from megloc_kapture.errors import (
 )
 from megloc_kapture.io.files import (
     atomic_write,
-    check_component,
-    check_relative,
     output_error,
     reading,
     user_cache,
@@ -54,9 +49,6 @@ _REGISTRY = Path(__file__).with_name("registry.toml")
 _STATE_KEYS = ("state_dict", "model_state_dict", "model_state", "model", "net", "extractor")
 # prefixes from DataParallel, Lightning and torch.compile
 _PREFIXES = re.compile(r"^(module\.|model\.|_orig_mod\.)+")
-_Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
-_Text = Annotated[str, StringConstraints(min_length=1)]
-_FileName = Annotated[str, AfterValidator(check_relative)]
 
 
 # ----------------------------------------------------------------------------------- registry
@@ -65,11 +57,11 @@ _FileName = Annotated[str, AfterValidator(check_relative)]
 class PublishedFile(Options):
     """One published file of a network's weights; None where a value is unknown."""
 
-    name: _FileName  # in the folder of weights
-    also: tuple[_FileName, ...] = ()  # alternative names
-    url: _Url | None = None  # None: must be downloaded by hand from the network's page
-    size: Annotated[int, Field(gt=0)] | None = None  # bytes
-    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
+    name: str  # in the folder of weights
+    also: tuple[str, ...] = ()  # alternative names
+    url: str | None = None  # None: must be downloaded by hand from the network's page
+    size: int | None = None  # bytes
+    sha256: str | None = None
     convert: bool = False  # needs scripts/convert_weights.py
 
     @property
@@ -80,13 +72,13 @@ class PublishedFile(Options):
 class Weights(Options):
     """The checkpoint of one network."""
 
-    name: Annotated[str, AfterValidator(check_component)]
-    purpose: _Text
-    page: _Url
-    licence: _Text  # short name
-    terms: _Text  # licence terms in plain words
+    name: str
+    purpose: str
+    page: str
+    licence: str  # short name
+    terms: str  # licence terms in plain words
     commercial: bool  # commercial use is plainly allowed
-    files: Annotated[tuple[PublishedFile, ...], Field(min_length=1)]  # preferred first
+    files: tuple[PublishedFile, ...]  # preferred first
     unverified: str = ""  # facts not confirmed on the original file
 
     @property
@@ -103,7 +95,7 @@ class Weights(Options):
 def registry() -> Mapping[str, Weights]:
     """Return all networks by name, in the order of ``registry.toml``."""
     table = tomllib.loads(_REGISTRY.read_text(encoding="utf-8"))
-    return MappingProxyType({name: Weights(name=name, **entry) for name, entry in table.items()})
+    return {name: Weights(name=name, **entry) for name, entry in table.items()}
 
 
 def lookup(name: str) -> Weights:
@@ -371,7 +363,6 @@ def add_weights(
 
     An ``unverified`` file may differ from the published one and is used only if that is absent.
     """
-    require(source.is_file(), "no such file", path=source)
     described = describe(source.name, source)
     sha256 = sha256_of(described)
     weights, target = _recognised(source, sha256, name)
@@ -400,7 +391,6 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
     )
     if output.exists() and not force:
         raise OutputError(f"{output}: exists; -f replaces it")
-    require(source.is_file(), "no such file", path=source)
     file = describe(source.name, source)
     # safetensors rejects tensors that share memory, so each is copied
     tensors = {name: tensor.contiguous().clone() for name, tensor in read_weights(file).items()}
@@ -415,19 +405,15 @@ def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, s
     if name is not None and is_converted:
         return among[0], among[0].converted
     files = [(weights, file) for weights in among for file in weights.files]
-    same = [(weights, file) for weights, file in files if file.sha256 == sha256]
-    named = [
-        (weights, file)
-        for weights, file in files
-        if source.name in [Path(path).name for path in file.names]
+    rules: list[Callable[[PublishedFile], bool]] = [
+        lambda file: file.sha256 == sha256,
+        lambda file: source.name in [Path(path).name for path in file.names],
+        lambda file: name is not None and Path(file.name).suffix == source.suffix,
     ]
-    alike = [
-        (weights, file)
-        for weights, file in files
-        if name is not None and Path(file.name).suffix == source.suffix
-    ]
-    for weights, file in (*same, *named, *alike):
-        return weights, file.name
+    for fits in rules:
+        for weights, file in files:
+            if fits(file):
+                return weights, file.name
     if is_converted and source.stem in registry():
         return registry()[source.stem], source.name
     if name is None:

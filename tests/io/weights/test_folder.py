@@ -198,7 +198,7 @@ def test_broken_missing_and_different_files_are_not_added(folder: Path, tmp_path
         (different, False, r"published superpoint_v1\.pth .* instead of 52b67"),
         (broken, False, "not weights of torch"),
         (broken, True, "not weights of torch"),
-        (tmp_path / "nowhere.pth", False, "no such file"),
+        (tmp_path / "nowhere.pth", False, "the file is missing"),
     ):
         with pytest.raises(DataError, match=message):
             add_weights(source, unverified=unverified)
@@ -254,7 +254,7 @@ def test_conversions_of_wrong_paths_are_refused(tmp_path: Path) -> None:
     output.touch()
     refusals: list[tuple[Path, Path, type[MeglocError], str]] = [
         (source, tmp_path / "x.npz", OptionError, "must end in .safetensors"),
-        (tmp_path / "y.pth", tmp_path / "y.safetensors", DataError, "no such file"),
+        (tmp_path / "y.pth", tmp_path / "y.safetensors", DataError, "the file is missing"),
         (source, output, OutputError, "exists; -f replaces it"),
     ]
     for wrong, target, kind, message in refusals:
@@ -286,6 +286,7 @@ def test_no_file_is_listed_twice() -> None:
     assert len(names) == len(set(names))
     sums = [file.sha256 for w in registry().values() for file in w.files if file.sha256]
     assert len(sums) == len(set(sums)) > 20
+    assert all(re.fullmatch("[0-9a-f]{64}", sha256) for sha256 in sums)
     assert all(name == weights.name for name, weights in registry().items())
 
 
