@@ -22,7 +22,7 @@ from megloc_kapture.io.colmap_model import (
     BINARY_FILES,
     TEXT_FILES,
     ColmapModel,
-    complete_model_files,
+    colmap_model_files,
     read_colmap_model,
 )
 from megloc_kapture.io.files import link_as_text, link_records, similar_name
@@ -60,7 +60,7 @@ class ColmapFolders:
     database: Path | None
 
     def files(self) -> Iterator[Path]:
-        yield from complete_model_files(self.model)
+        yield from colmap_model_files(self.model)
         if self.database is not None:
             yield self.database
 

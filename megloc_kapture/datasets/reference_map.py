@@ -7,7 +7,7 @@ folders. Here databases are opened as ``immutable``, which creates no files even
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -146,11 +146,6 @@ def published_database(path: Path | None, remarks: list[str]) -> Path | None:
         "`megloc localize` extracts them again from the images."
     )
     return None
-
-
-def check_model_files(files: Iterable[Path]) -> None:
-    for file in files:
-        require(file.is_file(), "missing; the reference model is read from it", path=file)
 
 
 def write_reference_map(

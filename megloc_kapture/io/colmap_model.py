@@ -124,7 +124,7 @@ class ColmapModel:
 
 
 def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path, ...]:
-    """Return the files of the model in a folder; binary ones are preferred."""
+    """Return the files of a model, binary ones preferred; DataError if one is missing."""
     folder = Path(folder)
     names = next((n for n in (BINARY_FILES, TEXT_FILES) if (folder / n[1]).exists()), None)
     if names is None:
@@ -132,17 +132,11 @@ def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path,
             f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here", path=folder
         )
     paths = [folder / name for name in (names if with_points else names[:2])]
-    more = [folder / f"{name}{paths[0].suffix}" for name in _RIG_FILES]
-    return (*paths, *(path for path in more if path.exists()))
-
-
-def complete_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path, ...]:
-    """Return :func:`colmap_model_files`; raise DataError if one is missing."""
-    paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
         remedy = "; an empty file is a model of poses only" if path.name == "points3D.txt" else ""
         require(path.is_file(), f"file is missing{remedy}", path=path)
-    return paths
+    more = [folder / f"{name}{paths[0].suffix}" for name in _RIG_FILES]
+    return (*paths, *(path for path in more if path.exists()))
 
 
 def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
@@ -150,7 +144,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
 
     Points whose tracks name images or features that the model lacks are ignored, with a warning.
     """
-    paths = complete_model_files(folder, with_points=with_points)
+    paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
         if path.name != "points3D.txt" and (failed := failed_download(path)):
             raise DataError(failed, path=path)

@@ -22,7 +22,6 @@ from megloc_kapture.io.colmap_model import (
     ColmapModel,
     SparsePoints,
     colmap_model_files,
-    complete_model_files,
     read_colmap_model,
 )
 from megloc_kapture.io.images import write_image
@@ -221,7 +220,7 @@ def test_binary_files_take_precedence_over_text_and_poses_need_no_points(tmp_pat
     (tmp_path / "points3D.bin").unlink()
     poses = read_colmap_model(tmp_path, with_points=False)
     assert (poses.cameras, poses.images, len(poses.points)) == (SMALL.cameras, SMALL.images, 0)
-    for read in (read_colmap_model, complete_model_files):
+    for read in (read_colmap_model, colmap_model_files):
         with pytest.raises(DataError, match=r"points3D\.bin: file is missing"):
             read(tmp_path)
     names = ("cameras.bin", "images.bin")

@@ -25,7 +25,7 @@ from megloc_kapture.datasets.official import (
     last_part,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import check_model_files, published_database
+from megloc_kapture.datasets.reference_map import published_database
 from megloc_kapture.errors import OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
@@ -120,12 +120,6 @@ class Layout:
             path=self.root,
         )
         return wanted
-
-    def model_files(self, version: Version, *, with_points: bool) -> tuple[Path, ...]:
-        if version == "1.1":
-            return colmap_model_files(self.colmap_model, with_points=with_points)
-        files = (self.nvm, self.database_intrinsics)
-        return tuple(file for file in files if file.is_file())
 
     def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
         """Read the existing images, and count v1.1's queries omitted from v1.0."""
@@ -287,10 +281,8 @@ class Aachen:
         layout = Layout(root)
         if absent := layout.absent():
             raise self.card.without(root, absent)
-        reference = self.options.reference_model
-        files = layout.model_files(layout.version(self.options.version), with_points=reference)
-        if reference:
-            check_model_files(files)
+        if layout.version(self.options.version) == "1.1":
+            colmap_model_files(layout.colmap_model, with_points=self.options.reference_model)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)

@@ -151,11 +151,14 @@ class Layout:
             model == "auto" and (self.merged_model.is_file() or not self.individual_models())
         )
 
-    def points_files(self, model: ModelChoice) -> list[Path]:
+    def check_points(self, model: ModelChoice) -> None:
+        """Raise DataError if a file of the model with its points is missing."""
         if self.is_merged(model):
-            return [self.merged_model]
-        folders = self.individual_models().values()
-        return [file for folder in folders for file in colmap_model_files(folder)]
+            remedy = "missing; the reference model is read from it"
+            require(self.merged_model.is_file(), remedy, path=self.merged_model)
+        else:
+            for folder in self.individual_models().values():
+                colmap_model_files(folder)
 
     def num_reference_images(self) -> int:
         folders = (self.images / REFERENCE_CONDITION / camera for camera in CAMERAS)

@@ -18,7 +18,7 @@ from megloc_kapture.datasets.official import (
     OfficialDataset,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import check_model_files, published_database
+from megloc_kapture.datasets.reference_map import published_database
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
@@ -129,7 +129,7 @@ class RobotCar:
         elif absent := Layout(root).absent():
             raise self.card.without(root, absent, with_locations=True)
         elif self.options.reference_model:
-            check_model_files(Layout(root).points_files(self.options.model))
+            Layout(root).check_points(self.options.model)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)
