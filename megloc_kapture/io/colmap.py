@@ -103,8 +103,7 @@ def undistorted_pinhole(camera: Camera) -> Camera:
     All its pixels lie inside the distorted image.
     """
     pycolmap = load_pycolmap()
-    options = pycolmap.UndistortCameraOptions()
-    options.blank_pixels = 0.0
+    options = pycolmap.UndistortCameraOptions()  # by default without blank pixels
     pinhole = pycolmap.undistort_camera(options, colmap_camera(camera))
     return replace(Camera.from_colmap(pinhole), focal_deviation=camera.focal_deviation)
 
@@ -147,8 +146,6 @@ def focal_from_matches(
 # ------------------------------------------------------------------------------- triangulation
 
 
-# COLMAP's defaults: reprojection error of an observation, and angle between the rays of a point
-_MAX_REPROJECTION_ERROR_PX, _MIN_ANGLE_DEG = 4.0, 1.5
 # relative decrease of the cost that ends an adjustment; with COLMAP's 0, triangulation takes 1.4
 # times as long on redkitchen_rgbd, and 99 % of the points differ by at most 1 mm
 _FUNCTION_TOLERANCE = 1e-4
@@ -216,11 +213,6 @@ def triangulate(
         # COLMAP uses the seeds for long tracks only, without a known effect on points
         pipeline.random_seed = pipeline.triangulation.random_seed = 0
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
-        pipeline.triangulation.min_angle = _MIN_ANGLE_DEG
-        pipeline.triangulation.merge_max_reproj_error = _MAX_REPROJECTION_ERROR_PX
-        pipeline.triangulation.complete_max_reproj_error = _MAX_REPROJECTION_ERROR_PX
-        pipeline.mapper.filter_max_reproj_error = _MAX_REPROJECTION_ERROR_PX
-        pipeline.mapper.filter_min_tri_angle = _MIN_ANGLE_DEG
         pipeline.ba_global_function_tolerance = _FUNCTION_TOLERANCE
         result_path = Path(folder) / "result"
         result_path.mkdir()
