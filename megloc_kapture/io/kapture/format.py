@@ -66,11 +66,15 @@ class Sensor:
         return cls(name, sensor_type, params + tuple(_shortest(p) for p in camera.params))
 
 
+# numbers of records and rigs when it was made; records by image; rigs by member
+_Index = tuple[tuple[int, int], dict[str, tuple[int, str]], dict[str, list[str]]]
+
+
 @dataclass
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
 
-    The dicts may be changed, but once poses have been requested, ``rigs`` may only get new rigs.
+    After the first look-up of an image, ``records_camera`` and ``rigs`` may only get new entries.
 
     Attributes
     ----------
@@ -84,37 +88,17 @@ class KaptureData:
     trajectories: dict[tuple[int, str], RigidTransform] = field(default_factory=dict)
     records_camera: dict[tuple[int, str], str] = field(default_factory=dict)
     records_depth: dict[tuple[int, str], str] = field(default_factory=dict)
-    _record_by_image: dict[str, tuple[int, str]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
-    _rigs_of: dict[str, list[str]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
-    _num_rigs: int = field(default=0, init=False, repr=False, compare=False)
+    _index: _Index | None = field(default=None, init=False, repr=False, compare=False)
 
     def image_names(self) -> list[str]:
         return sorted(self.records_camera.values())
 
     def record_of(self, image: str) -> tuple[int, str]:
         """Return ``(timestamp, sensor id)`` of an image."""
-        index = self._record_by_image
-        key = index.get(image)
-        # rebuild the index after any relevant change
-        if (
-            key is None
-            or len(index) != len(self.records_camera)
-            or self.records_camera.get(key) != image
-        ):
-            index = {}
-            for record, name in self.records_camera.items():
-                if name in index:
-                    raise DataError(f"image {name!r} has two records: {index[name]} and {record}")
-                index[name] = record
-            self._record_by_image = index
-            key = index.get(image)
-        if key is None:
+        record = self._indexed()[1].get(image)
+        if record is None:
             raise DataError(f"no image {image!r} in the camera records")
-        return key
+        return record
 
     def camera_of(self, image: str) -> Camera:
         sensor_id = self.record_of(image)[1]
@@ -134,7 +118,7 @@ class KaptureData:
         """Return the pose of a sensor or rig at a time, directly or through its rigs, or None."""
         if (timestamp, device_id) in self.trajectories:
             return self.trajectories[timestamp, device_id]
-        for rig_id in self._parents().get(device_id, ()):
+        for rig_id in self._indexed()[2].get(device_id, ()):
             rig_from_world = self.device_from_world(timestamp, rig_id)
             if rig_from_world is not None:
                 return self.rigs[rig_id][device_id] @ rig_from_world
@@ -145,14 +129,20 @@ class KaptureData:
         poses = {image: self.cam_from_world(image) for image in self.image_names()}
         return {image: pose for image, pose in poses.items() if pose is not None}
 
-    def _parents(self) -> dict[str, list[str]]:
-        if self._num_rigs != len(self.rigs):
-            self._rigs_of = {}
-            self._num_rigs = len(self.rigs)
+    def _indexed(self) -> _Index:
+        sizes = len(self.records_camera), len(self.rigs)
+        if self._index is None or self._index[0] != sizes:
+            records: dict[str, tuple[int, str]] = {}
+            for record, image in self.records_camera.items():
+                if image in records:
+                    raise DataError(f"image {image!r} has two records: {records[image]}, {record}")
+                records[image] = record
+            rigs: dict[str, list[str]] = {}
             for rig_id in sorted(self.rigs):
-                for sensor_id in self.rigs[rig_id]:
-                    self._rigs_of.setdefault(sensor_id, []).append(rig_id)
-        return self._rigs_of
+                for member in self.rigs[rig_id]:
+                    rigs.setdefault(member, []).append(rig_id)
+            self._index = sizes, records, rigs
+        return self._index
 
 
 def _shortest(value: float) -> str:
