@@ -28,7 +28,7 @@ from megloc_kapture.io.files import (
 )
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.kapture.sensors import unit_quaternion
-from megloc_kapture.io.text_lines import numbers_of, read_camera_rows, reading_lines
+from megloc_kapture.io.text_lines import numbers_of, read_camera_rows
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 _log = logging.getLogger(__name__)
@@ -36,7 +36,6 @@ _log = logging.getLogger(__name__)
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 IMAGE_COLUMNS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-_POINT_COLUMNS = "POINT3D_ID X Y Z R G B ERROR"
 # an image size in cameras.txt, written as float by scripts: 1920.0 1080.0
 _SIZE = re.compile(r"^(\s*\d+\s+\w+\s+\d+)\.0*(\s+\d+)\.0*(?=\s)", re.MULTILINE)
 _RIG_FILES = ("rigs", "frames")  # since COLMAP 3.12
@@ -173,11 +172,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
             except Exception as error:
                 if names:
                     read_camera_rows(paths[0])  # names the line of a wrong camera
-                if not with_points:
-                    raise
-                if not isinstance(error, IndexError):
-                    if names:
-                        _check_point_rows(paths[2])
+                if not with_points or not isinstance(error, IndexError):
                     raise
                 model = None
     if model is None:
@@ -238,15 +233,6 @@ def _images_for_pycolmap(path: Path, cameras: Path) -> tuple[str, dict[int, str]
         names[image_id] = row[9]
         lines.append(f"{' '.join(row[:9])} {image_id}\n{features}\n")
     return "".join(lines), names
-
-
-def _check_point_rows(path: Path) -> None:
-    with reading_lines(path, comments=True) as lines:
-        for line in lines:
-            fields = line.split()
-            numbers_of(fields[:8], _POINT_COLUMNS)
-            colour = " ".join(fields[4:7])
-            require(colour.replace(" ", "").isdigit(), f"R G B {colour!r} are not whole numbers")
 
 
 def _check_complete(path: Path) -> None:

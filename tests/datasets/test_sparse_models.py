@@ -245,8 +245,8 @@ IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n\n8 1 0 0 0 0 0 0 1 db/8.jpg\n\n"
         ("images", "db/7", "../7", "images.txt: image '../7.jpg': .*leads out"),
         ("images", "db/8", "db/7", "'db/7.jpg': is listed twice"),
         ("images", "7 1", "version https://git-lfs", "images.txt: a Git LFS pointer; fetch"),
-        ("points3D", "", "1 2 3 4 5 6 7", "points3D.txt:1: expected finite numbers POINT3D_ID"),
-        ("points3D", "", "1 2 3 4 .5 .6 0 1", "points3D.txt:1: R G B '.5 .6 0' are not whole"),
+        ("points3D", "", "1 2 3 4 5 6 7", "not a model that COLMAP can read .*points3D.txt"),
+        ("points3D", "", "1 2 3 4 .5 .6 0 1", "not a model that COLMAP can read .*points3D.txt"),
     ],
 )
 def test_a_wrong_text_model_is_named(
