@@ -46,9 +46,6 @@ def load_pycolmap() -> Any:
 @contextmanager
 def quiet_stderr() -> Iterator[None]:
     # COLMAP writes progress to file descriptor 2 at every log level
-    if os.environ.get("MEGLOC_COLMAP_LOG"):
-        yield
-        return
     saved = os.dup(2)
     null = os.open(os.devnull, os.O_WRONLY)
     try:
