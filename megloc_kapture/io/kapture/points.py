@@ -199,13 +199,7 @@ def write_observations(root: Path, observations: Mapping[str, Observations]) -> 
     rows = merge(*(_rows(name, of_type) for name, of_type in sorted(observations.items())))
     with atomic_write(Path(root) / "reconstruction" / "observations.txt") as file:
         file.write(f"{FORMAT_LINE}\n{OBSERVATIONS_HEADER}\n".encode())
-        block: list[str] = []
-        for point, keypoints_type, pairs in rows:
-            block.append(f"{point}, {keypoints_type}{pairs}\n")
-            if len(block) == _ROWS_AT_ONCE:
-                file.write("".join(block).encode())
-                block.clear()
-        file.write("".join(block).encode())
+        file.writelines(f"{point}, {name}{pairs}\n".encode() for point, name, pairs in rows)
 
 
 def _rows(keypoints_type: str, observations: Observations) -> Iterator[tuple[int, str, str]]:
