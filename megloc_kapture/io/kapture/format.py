@@ -180,11 +180,7 @@ def check_columns(fields: Sequence[str], expected: int) -> None:
 
 def writable_name(name: str) -> str:
     """Replace commas, outer spaces and a leading # by ``_``; :func:`format_table` rejects them."""
-    name = name.replace(",", "_")
-    middle = name.strip()
-    left = len(name) - len(name.lstrip())
-    name = "_" * left + middle + "_" * (len(name) - left - len(middle))
-    return f"_{name[1:]}" if name.startswith("#") else name
+    return re.sub(r",|^#|^\s+|\s+$", lambda match: "_" * len(match[0]), name)
 
 
 def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:
