@@ -119,16 +119,10 @@ class KaptureFolder:
     def observations(self) -> dict[str, Observations]:
         """Return the observations of the 3D points by keypoints type; cached, read-only."""
         if self._observations is None:
-            path = self._observations_path
-            by_type = read_observations(path)
-            num_points = len(self.points3d())
-            for keypoints_type, observations in by_type.items():
-                self._check_observations(keypoints_type, observations, num_points, path)
-                for array in (
-                    observations.point_ids,
-                    observations.image_ids,
-                    observations.keypoint_ids,
-                ):
+            by_type = read_observations(self._observations_path)
+            for keypoints_type, of_type in by_type.items():
+                self._check_observations(keypoints_type, of_type)
+                for array in (of_type.point_ids, of_type.image_ids, of_type.keypoint_ids):
                     array.setflags(write=False)
             self._observations = by_type
         return dict(self._observations)
@@ -212,9 +206,8 @@ class KaptureFolder:
                     f"point past the keypoints of {image!r}",
                 )
 
-    def _check_observations(
-        self, keypoints_type: str, observations: Observations, num_points: int, path: Path
-    ) -> None:
+    def _check_observations(self, keypoints_type: str, observations: Observations) -> None:
+        num_points = len(self.points3d())
         limit = np.full(len(observations.image_names), np.iinfo(np.int32).max, dtype=np.int64)
         if keypoints_type in self.types("keypoints"):
             keypoints = self.keypoints(keypoints_type)
@@ -229,7 +222,7 @@ class KaptureFolder:
                 f"point {observations.point_ids[first]}, keypoint "
                 f"{observations.keypoint_ids[first]} of {observations.image_names[image]!r}: there "
                 f"are {num_points} points and {limit[image]} keypoints of type {keypoints_type!r}",
-                path=path,
+                path=self._observations_path,
             )
 
 
