@@ -20,7 +20,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.kapture.matches import MatchesReader
+from megloc_kapture.io.kapture.features import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages.local_features import warn_of_other_size

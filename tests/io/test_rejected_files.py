@@ -18,15 +18,15 @@ from megloc_kapture.io.images import image_size, read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
     ArrayKind,
-    Blobs,
     FeatureConfig,
     FeatureReader,
     FeatureWriter,
     feature_folder,
     list_types,
+    open_folders,
     read_config,
+    read_pairs,
 )
-from megloc_kapture.io.kapture.matches import read_pairs
 from megloc_kapture.io.kapture.points import read_observations, read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 
@@ -213,7 +213,7 @@ def test_a_compressed_tar_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "keypoints.tar"
     path.write_bytes(b"\x1f\x8b\x08packed")
     with pytest.raises(DataError, match=r"keypoints\.tar: not an uncompressed tar"):
-        Blobs(tmp_path, "keypoints")
+        open_folders([tmp_path], "keypoints")
 
 
 def test_a_depth_map_in_millimetres_is_named(tmp_path: Path) -> None:

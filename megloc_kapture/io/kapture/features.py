@@ -1,9 +1,14 @@
-"""Keypoints, descriptors and global features: one binary array per image.
+"""Keypoints, descriptors and global features of images; matches and pairs of images.
 
-They are stored inside a kapture (``reconstruction/<kind>/T/``) or in kapture-localization's orphan
-layout (``local_features/T/<kind>/``, ``global_features/T/global_features/``), as files or as a
-single tar. The folder name ``T`` is the type name; ``name`` in the configuration file is not used.
-Arrays are raw, little-endian, row-major, without a header.
+Features, one binary array per image, are stored inside a kapture (``reconstruction/<kind>/T/``) or
+in kapture-localization's orphan layout (``local_features/T/<kind>/``,
+``global_features/T/global_features/``), as files or as a single tar. The folder name ``T`` is the
+type name; ``name`` in the configuration file is not used. Arrays are raw, little-endian, row-major,
+without a header.
+
+The matches of a pair are stored as SMALLER.overlapping/LARGER.matches, ordered by name, in float64
+rows (M, 3): index, index, score. kapture's own writers do not order the names, so both orders are
+read. Pairs files are kapture-localization's: query image, map image, score.
 """
 
 from __future__ import annotations
@@ -11,11 +16,11 @@ from __future__ import annotations
 import os
 import re
 import tarfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,8 +33,10 @@ from megloc_kapture.io.files import (
     reading,
     safe_join,
     write_bytes,
+    writing,
 )
 from megloc_kapture.io.kapture.format import check_columns, format_table, read_rows
+from megloc_kapture.io.text_lines import numbers_of
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
 ArrayKind = Literal["keypoints", "descriptors", "global_features"]
@@ -50,6 +57,11 @@ DTYPES: dict[str, np.dtype[Any]] = {
     name: np.dtype(code)
     for name, code in (("float32", "<f4"), ("float64", "<f8"), ("int32", "<i4"), ("uint8", "u1"))
 }
+_BETWEEN = ".overlapping/"
+_ROW_BYTES = 3 * 8
+# kapture stores indices as float64, which is exact up to this value
+_MAX_INDEX = 2**53
+PAIRS_HEADER = "# query_image, map_image, score"
 _ROUNDING = 4e-7  # rows whose squared length differs from 1 by at most this stay unchanged
 
 
@@ -141,62 +153,70 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
 # ------------------------------------------------------------------------------------ files
 
 
-class Blobs:
-    """Feature arrays (blobs) of a type's folder: loose files, or members of its tar; thread-safe.
+class Blob(NamedTuple):
+    """The array of an image or pair: a file, or a member of a tar."""
 
-    The tar is uncompressed, kapture's form for many files.
-    """
+    name: str
+    path: str
+    offset: int  # 0 in a file
+    size: int
 
-    def __init__(self, folder: Path, kind: FeatureKind) -> None:
-        self._folder, self._suffix = folder, SUFFIX[kind]
-        self._tar = folder / f"{kind}.tar"
-        self._members: dict[str, tuple[int, int]] = {}  # offset and size in the tar
-        if not self._tar.is_file() or self._tar.stat().st_size == 0:
-            return  # kapture creates a tar as an empty file
-        with (
-            reading(self._tar, "an uncompressed tar"),
-            named(self._tar),
-            tarfile.open(self._tar, "r:") as tar,
-        ):
-            for member in tar:
-                if member.isreg() and member.name.endswith(self._suffix):
-                    name = check_relative(member.name.removeprefix("./"))
-                    self._members[name] = (member.offset_data, member.size)
-
-    def names(self) -> list[str]:
-        names = list(self._members)
-        for folder, _, files in os.walk(self._folder):
-            below = folder[len(str(self._folder)) :].lstrip("/")
-            prefix = f"{below}/" if below else ""
-            names += [prefix + name for name in files if name.endswith(self._suffix)]
-        return sorted(names)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._members or os.path.isfile(self._file(name))
-
-    def size(self, name: str) -> int:
-        if name in self._members:
-            return self._members[name][1]
-        with reading(self._file(name)):
-            return os.stat(self._file(name)).st_size
-
-    def read(self, name: str) -> bytes:
-        if name not in self._members:
-            path = self._file(name)
-            with reading(path), open(path, "rb", buffering=0) as file:
-                return file.readall()
-        offset, size = self._members[name]
-        with reading(self._tar), open(self._tar, "rb", buffering=0) as file:
-            content = os.pread(file.fileno(), size, offset)
-        if len(content) < size:
-            raise DataError(f"truncated at member {name!r}", path=self._tar)
+    def read(self) -> bytes:
+        with reading(self.path), open(self.path, "rb", buffering=0) as file:
+            content = os.pread(file.fileno(), self.size, self.offset)
+        require(len(content) == self.size, "truncated", path=self.where)
         return content
 
-    def where(self, name: str) -> str:
-        return f"{self._tar}[{name}]" if name in self._members else str(self._folder / name)
+    @property
+    def where(self) -> str:
+        return f"{self.path}[{self.name}]" if self.offset else self.path
 
-    def _file(self, name: str) -> str:
-        return f"{self._folder}/{check_relative(name)}"  # creating a Path is much slower
+
+# folders of a type, each with the members of its tar by name
+BlobFolders = Mapping[Path, Mapping[str, Blob]]
+
+
+def open_folders(folders: Sequence[Path], kind: FeatureKind) -> BlobFolders:
+    return {folder: _tar_members(folder / f"{kind}.tar", SUFFIX[kind]) for folder in folders}
+
+
+def _tar_members(path: Path, suffix: str) -> dict[str, Blob]:
+    """List the members of an uncompressed tar, kapture's form for many files, if it exists."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return {}  # kapture creates a tar as an empty file
+    members = {}
+    with reading(path, "an uncompressed tar"), named(path), tarfile.open(path, "r:") as tar:
+        for member in tar:
+            if member.isreg() and member.name.endswith(suffix):
+                name = check_relative(member.name.removeprefix("./"))
+                members[name] = Blob(name, str(path), member.offset_data, member.size)
+    return members
+
+
+def list_blobs(folders: BlobFolders, kind: FeatureKind) -> dict[str, str]:
+    """Return the path of each blob by name."""
+    paths: dict[str, str] = {}
+    for root, members in folders.items():
+        paths |= {name: blob.where for name, blob in members.items()}
+        for folder, _, files in os.walk(root):
+            below = f"{folder}/".removeprefix(f"{root}/")
+            paths |= {below + n: f"{folder}/{n}" for n in files if n.endswith(SUFFIX[kind])}
+    return paths
+
+
+def find_blob(folders: BlobFolders, *names: str) -> Blob | None:
+    """Return the blob with one of the names from the first folder that has it, or None."""
+    for folder, members in folders.items():
+        for name in names:
+            if name in members:
+                return members[name]
+            path = f"{folder}/{check_relative(name)}"  # creating a Path is much slower
+            try:
+                size = os.stat(path).st_size
+            except OSError:
+                continue
+            return Blob(name, path, 0, size)
+    return None
 
 
 # --------------------------------------------------------------------------------- reading
@@ -210,7 +230,7 @@ class FeatureReader:
 
     def __init__(self, kind: ArrayKind, type_name: str, folders: Sequence[Path]) -> None:
         self.kind, self.type_name = kind, type_name
-        self._sources = [Blobs(folder, kind) for folder in folders]
+        self._folders = open_folders(folders, kind)
         paths = [folder / f"{kind}.txt" for folder in folders]
         self.config, *others = [read_config(path, kind) for path in paths]
         for path, config in zip(paths[1:], others, strict=True):
@@ -223,50 +243,44 @@ class FeatureReader:
 
     @cached_property
     def names(self) -> list[str]:
-        cut = len(SUFFIX[self.kind])
-        return sorted({n[:-cut] for s in self._sources for n in s.names()})
+        names = list_blobs(self._folders, self.kind)
+        return sorted(name.removesuffix(SUFFIX[self.kind]) for name in names)
 
     def __contains__(self, image: str) -> bool:
-        name = image + SUFFIX[self.kind]
-        return any(name in source for source in self._sources)
+        return find_blob(self._folders, image + SUFFIX[self.kind]) is not None
 
     def length(self, image: str) -> int:
         """Return the number of rows of an image's array, from the file size."""
-        source, name = self._source(image)
-        return self._num_rows(source.size(name), source, name)
+        return self._num_rows(self._blob(image))
 
     def read(self, image: str) -> NDArray[Any]:
         """Read an image's array, (N, dsize) or (dsize,) for global features; finite, writable."""
-        source, name = self._source(image)
-        content = source.read(name)
-        rows = self._num_rows(len(content), source, name)
-        array = np.frombuffer(content, dtype=self.config.dtype)
-        if not np.isfinite(array).all():
-            raise DataError("not all values are finite", path=source.where(name))
+        blob = self._blob(image)
+        rows = self._num_rows(blob)
+        array = np.frombuffer(blob.read(), dtype=self.config.dtype)
+        require(np.isfinite(array).all(), "not all values are finite", path=blob.where)
         shape = (-1,) if self.kind == "global_features" else (rows, self.config.dsize)
         return array.reshape(shape).copy()
 
     def where(self, image: str) -> str:
-        source, name = self._source(image)
-        return source.where(name)
+        return self._blob(image).where
 
-    def _num_rows(self, size: int, source: Blobs, name: str) -> int:
-        rows, rest = divmod(size, self.config.dsize * self.config.dtype.itemsize)
+    def _num_rows(self, blob: Blob) -> int:
+        rows, rest = divmod(blob.size, self.config.dsize * self.config.dtype.itemsize)
         if rest or (self.kind == "global_features" and rows != 1):
             expected = "exactly one row" if self.kind == "global_features" else "whole rows"
             raise DataError(
-                f"{size} bytes are not {expected} of "
+                f"{blob.size} bytes are not {expected} of "
                 f"{self.config.dsize} x {self.config.dtype.name}; truncated?",
-                path=source.where(name),
+                path=blob.where,
             )
         return rows
 
-    def _source(self, image: str) -> tuple[Blobs, str]:
-        name = image + SUFFIX[self.kind]
-        for source in self._sources:
-            if name in source:
-                return source, name
-        raise DataError(f"no {self.kind} of type {self.type_name!r} for image {image!r}")
+    def _blob(self, image: str) -> Blob:
+        blob = find_blob(self._folders, image + SUFFIX[self.kind])
+        if blob is None:
+            raise DataError(f"no {self.kind} of type {self.type_name!r} for image {image!r}")
+        return blob
 
 
 class KaptureVectors:
@@ -336,3 +350,123 @@ class FeatureWriter:
         )
         path = safe_join(self._folder, image + SUFFIX[self.kind])
         write_bytes(path, content.tobytes())
+
+
+# ------------------------------------------------------------------------------------ matches
+
+
+class MatchesReader:
+    """Matches of one keypoints type from several folders; the first that has a pair is used."""
+
+    def __init__(self, type_name: str, folders: Sequence[Path]) -> None:
+        self.type_name = type_name
+        self._folders = open_folders(folders, "matches")
+
+    @cached_property
+    def pairs(self) -> list[tuple[str, str]]:
+        pairs = set()
+        for name, path in list_blobs(self._folders, "matches").items():
+            parts = name.removesuffix(SUFFIX["matches"]).split(_BETWEEN)
+            if len(parts) != 2 or parts[0] == parts[1]:
+                raise DataError("does not name a pair of images", path=path)
+            pairs.add((min(parts), max(parts)))
+        return sorted(pairs)
+
+    def __contains__(self, pair: tuple[str, str]) -> bool:
+        return self._find(*pair) is not None
+
+    def length(self, a: str, b: str) -> int:
+        """Return the number of matches of a pair from its file size; 0 without a file."""
+        blob = self._find(a, b)
+        return 0 if blob is None else blob.size // _ROW_BYTES
+
+    def read(self, a: str, b: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Read the indices int64 (M, 2) into ``a`` and ``b`` and scores float64 (M,) of a pair."""
+        blob = self._find(a, b)
+        if blob is None:
+            raise DataError(f"no matches of type {self.type_name!r} for {a!r} and {b!r}")
+        require(
+            blob.size % _ROW_BYTES == 0,
+            f"{blob.size} bytes are not whole rows of 3 x float64; truncated?",
+            path=blob.where,
+        )
+        rows = np.frombuffer(blob.read(), dtype="<f8").reshape(-1, 3)
+        columns = rows[:, :2]
+        with np.errstate(invalid="ignore"):
+            valid = (columns >= 0) & (columns < _MAX_INDEX) & (columns == np.floor(columns))
+        if not valid.all():
+            row = int(np.flatnonzero(~valid.all(axis=1))[0])
+            raise DataError(
+                f"row {row}: {columns[row].tolist()} are not keypoint indices", path=blob.where
+            )
+        if blob.name != _name(a, b):
+            columns = columns[:, ::-1]
+        return columns.astype(np.int64), rows[:, 2].copy()
+
+    def _find(self, a: str, b: str) -> Blob | None:
+        first, second = sorted((a, b))
+        return find_blob(self._folders, _name(first, second), _name(second, first))
+
+
+class MatchesWriter:
+    """Writer for the matches of one keypoints type; each file is written atomically."""
+
+    def __init__(self, root: Path, type_name: str, *, orphan: bool = False) -> None:
+        self._folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
+        with writing(self._folder):
+            # kapture finds a type by its folder, so it exists even if no pair is written
+            self._folder.mkdir(parents=True, exist_ok=True)
+
+    def __contains__(self, pair: tuple[str, str]) -> bool:
+        return safe_join(self._folder, _name(min(pair), max(pair))).is_file()
+
+    def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> None:
+        """Write indices (M, 2) in the order ``a``, ``b`` and scores (M,)."""
+        pairs = np.asarray(indices).reshape(-1, 2)
+        rows = np.empty((len(pairs), 3), dtype="<f8")
+        rows[:, :2] = pairs if a < b else pairs[:, ::-1]
+        rows[:, 2] = scores
+        write_bytes(safe_join(self._folder, _name(min(a, b), max(a, b))), rows.tobytes())
+
+
+def _name(first: str, second: str) -> str:
+    return f"{first}{_BETWEEN}{second}{SUFFIX['matches']}"
+
+
+# -------------------------------------------------------------------------------------- pairs
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class ImagePair:
+    """Two images to match; a higher score is a better candidate."""
+
+    query: str
+    map: str
+    score: float
+
+
+def read_pairs(path: Path | str) -> list[ImagePair]:
+    """Read a pairs file in its order, without repeated pairs.
+
+    Pairs without a score (in hloc's files, two names separated by a blank) rank in this order.
+    """
+    pairs: list[ImagePair] = []
+    seen: set[tuple[str, str]] = set()
+    with read_rows(Path(path)) as rows:
+        for fields in rows:
+            if len(fields) == 1:
+                fields = fields[0].split()
+            if len(fields) == 2:
+                fields = [*fields, str(-len(pairs))]
+            check_columns(fields, 3)
+            pair = check_relative(fields[0]), check_relative(fields[1])
+            (score,) = numbers_of(fields[2:], "score")
+            if pair not in seen:
+                seen.add(pair)
+                pairs.append(ImagePair(*pair, score))
+    return pairs
+
+
+def write_pairs(path: Path | str, pairs: Iterable[ImagePair]) -> None:
+    rows = [[pair.query, pair.map, repr(float(pair.score))] for pair in pairs]
+    write_bytes(path, format_table(PAIRS_HEADER, rows))

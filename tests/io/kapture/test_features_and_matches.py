@@ -13,17 +13,17 @@ from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
     ArrayKind,
-    Blobs,
     FeatureConfig,
     FeatureReader,
     FeatureWriter,
-    feature_folder,
-    list_types,
-)
-from megloc_kapture.io.kapture.matches import (
     ImagePair,
     MatchesReader,
     MatchesWriter,
+    feature_folder,
+    find_blob,
+    list_blobs,
+    list_types,
+    open_folders,
     read_pairs,
     write_pairs,
 )
@@ -104,11 +104,12 @@ def test_members_of_a_tar_of_the_current_folder_are_read_by_name(tmp_path: Path)
     for kind in ("keypoints", "descriptors"):
         with tarfile.open(folder / f"{kind}.tar", "w") as file:
             file.add(tmp_path / "in", ".")
-    blobs = pickle.loads(pickle.dumps(Blobs(folder, "keypoints")))
-    assert blobs.names() == sorted(contents)
-    assert {name: blobs.read(name) for name in contents} == contents
-    assert blobs.size("a.kpt") == 1000 and "a" not in blobs
-    assert Blobs(folder, "descriptors").names() == []
+    folders = pickle.loads(pickle.dumps(open_folders([folder], "keypoints")))
+    assert list_blobs(folders, "keypoints").keys() == contents.keys()
+    blobs = {name: find_blob(folders, name) for name in contents}
+    assert {name: blob and blob.read() for name, blob in blobs.items()} == contents
+    assert find_blob(folders, "a") is None and find_blob(folders, "a", "a.kpt") == blobs["a.kpt"]
+    assert list_blobs(open_folders([folder], "descriptors"), "descriptors") == {}
 
 
 # -------------------------------------------------------------------------------------- matches
