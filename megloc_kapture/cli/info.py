@@ -23,8 +23,8 @@ from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.folder import ARRAY_KINDS
-from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.kapture.points import read_point_covariances
+from megloc_kapture.io.kapture.sensors import UNKNOWN_CAMERA
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
 from megloc_kapture.pipeline.live_source import MapMatching

@@ -11,7 +11,7 @@ from megloc_kapture.io.kapture.features import (
     write_pairs,
 )
 from megloc_kapture.io.kapture.folder import KaptureFolder
-from megloc_kapture.io.kapture.format import KaptureData, Sensor, writable_name
+from megloc_kapture.io.kapture.format import writable_name
 from megloc_kapture.io.kapture.points import (
     Observations,
     read_point_covariances,
@@ -19,7 +19,7 @@ from megloc_kapture.io.kapture.points import (
     write_point_covariances,
     write_points3d,
 )
-from megloc_kapture.io.kapture.sensors import write_sensors
+from megloc_kapture.io.kapture.sensors import KaptureData, Sensor, write_sensors
 
 __all__ = [
     "FeatureConfig",

@@ -24,9 +24,8 @@ from megloc_kapture.io.kapture.features import (
     features_dir_hint,
     list_types,
 )
-from megloc_kapture.io.kapture.format import KaptureData
 from megloc_kapture.io.kapture.points import Observations, read_observations, read_points3d
-from megloc_kapture.io.kapture.sensors import read_kapture_data
+from megloc_kapture.io.kapture.sensors import KaptureData, read_kapture_data
 
 ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
 

@@ -1,4 +1,4 @@
-"""Tables in a kapture's ``sensors/``: sensors, rigs, trajectories and records.
+"""Records of a kapture (sensors, rigs, trajectories, images) and their tables in ``sensors/``.
 
 Floats are written with the fewest digits (up to 17) that restore the same float64. kapture allows
 partial poses: rows whose whole rotation or whole translation is blank are skipped; other blanks are
@@ -10,28 +10,23 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_relative, find_near, remove, write_bytes
-from megloc_kapture.io.kapture.format import (
-    CAMERA_SENSOR_TYPES,
-    UNKNOWN_CAMERA,
-    KaptureData,
-    Sensor,
-    check_columns,
-    format_table,
-    read_rows,
-)
+from megloc_kapture.io.files import check_relative, find_near, named, remove, write_bytes
+from megloc_kapture.io.kapture.format import check_columns, format_table, read_rows
 from megloc_kapture.io.text_lines import numbers_of
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 
 # a quaternion whose length differs from 1 by less than this (few digits in the text) is normalised
 MAX_QUATERNION_ERROR = 1e-3
 # a length within this of 1 is due to rounding; normalising would only change the last bits
 _QUATERNION_ROUNDING = 1e-14
 
+CAMERA_SENSOR_TYPES = ("camera", "depth")
+UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 _POSE_COLUMNS = "qw, qx, qy, qz, tx, ty, tz"
 _HEADERS = {
     "sensors": "# sensor_id, name, sensor_type, [sensor_params]+",
@@ -40,6 +35,126 @@ _HEADERS = {
     "records_camera": "# timestamp, device_id, image_path",
     "records_depth": "# timestamp, device_id, depth_map_path",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """One row of ``sensors.txt``; for a camera ``params`` are model, width, height, parameters."""
+
+    name: str
+    sensor_type: str
+    params: tuple[str, ...]
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether this is a camera without intrinsics (``UNKNOWN_CAMERA``)."""
+        return self.params[:1] == (UNKNOWN_CAMERA,)
+
+    def camera(self) -> Camera:
+        if self.sensor_type not in CAMERA_SENSOR_TYPES:
+            raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
+        if self.is_unknown:
+            raise DataError(
+                "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics, or estimate them: "
+                "`megloc localize --query` does so for queries, `megloc map` for map images"
+            )
+        require(len(self.params) > 2, "expected a camera model, width, height and parameters")
+        model, *texts = self.params
+        width, height, *params = map(float, texts)
+        size = width, height
+        require(size == (int(width), int(height)), f"image size {size} is not in whole pixels")
+        return Camera(model, int(width), int(height), tuple(params))
+
+    @classmethod
+    def from_camera(cls, camera: Camera, *, name: str = "", sensor_type: str = "camera") -> Sensor:
+        """Return the sensor whose :meth:`camera` is exactly ``camera``."""
+        params = (camera.model, str(int(camera.width)), str(int(camera.height)))
+        return cls(name, sensor_type, params + tuple(_shortest(p) for p in camera.params))
+
+
+# numbers of records and rigs when it was made; records by image; rigs by member
+_Index = tuple[tuple[int, int], dict[str, tuple[int, str]], dict[str, list[str]]]
+
+
+@dataclass
+class KaptureData:
+    """Sensors, rigs, trajectories and image records of one kapture.
+
+    After the first look-up of an image, ``records_camera`` and ``rigs`` may only get new entries.
+
+    Attributes
+    ----------
+    rigs : rig id -> sensor or rig id -> ``sensor_from_rig``.
+    trajectories : (timestamp, sensor or rig id) -> ``device_from_world``.
+    records_camera, records_depth : (timestamp, sensor id) -> path below ``records_data``.
+    """
+
+    sensors: dict[str, Sensor] = field(default_factory=dict)
+    rigs: dict[str, dict[str, RigidTransform]] = field(default_factory=dict)
+    trajectories: dict[tuple[int, str], RigidTransform] = field(default_factory=dict)
+    records_camera: dict[tuple[int, str], str] = field(default_factory=dict)
+    records_depth: dict[tuple[int, str], str] = field(default_factory=dict)
+    _index: _Index | None = field(default=None, init=False, repr=False, compare=False)
+
+    def image_names(self) -> list[str]:
+        return sorted(self.records_camera.values())
+
+    def record_of(self, image: str) -> tuple[int, str]:
+        """Return ``(timestamp, sensor id)`` of an image."""
+        record = self._indexed()[1].get(image)
+        if record is None:
+            raise DataError(f"no image {image!r} in the camera records")
+        return record
+
+    def camera_of(self, image: str) -> Camera:
+        sensor_id = self.record_of(image)[1]
+        if sensor_id not in self.sensors:
+            raise DataError(f"image {image!r} was taken by the unknown sensor {sensor_id!r}")
+        with named(about=f"sensor {sensor_id!r} of image {image!r}"):
+            return self.sensors[sensor_id].camera()
+
+    def cam_from_world(self, image: str) -> RigidTransform | None:
+        """Return the pose of an image, from its camera or from the first rig with a pose, or None.
+
+        Rigs may be nested.
+        """
+        return self.device_from_world(*self.record_of(image))
+
+    def device_from_world(self, timestamp: int, device_id: str) -> RigidTransform | None:
+        """Return the pose of a sensor or rig at a time, directly or through its rigs, or None."""
+        if (timestamp, device_id) in self.trajectories:
+            return self.trajectories[timestamp, device_id]
+        for rig_id in self._indexed()[2].get(device_id, ()):
+            rig_from_world = self.device_from_world(timestamp, rig_id)
+            if rig_from_world is not None:
+                return self.rigs[rig_id][device_id] @ rig_from_world
+        return None
+
+    def poses(self) -> dict[str, RigidTransform]:
+        """Return ``cam_from_world`` of every image that has one, sorted by image name."""
+        poses = {image: self.cam_from_world(image) for image in self.image_names()}
+        return {image: pose for image, pose in poses.items() if pose is not None}
+
+    def _indexed(self) -> _Index:
+        sizes = len(self.records_camera), len(self.rigs)
+        if self._index is None or self._index[0] != sizes:
+            records: dict[str, tuple[int, str]] = {}
+            for record, image in self.records_camera.items():
+                if image in records:
+                    raise DataError(f"image {image!r} has two records: {records[image]}, {record}")
+                records[image] = record
+            rigs: dict[str, list[str]] = {}
+            for rig_id in sorted(self.rigs):
+                for member in self.rigs[rig_id]:
+                    rigs.setdefault(member, []).append(rig_id)
+            self._index = sizes, records, rigs
+        return self._index
+
+
+def _shortest(value: float) -> str:
+    """Return the shortest text of a float64; whole numbers have no decimal point, as in kapture."""
+    value = float(value)
+    return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 
 # ------------------------------------------------------------------------------------ reading

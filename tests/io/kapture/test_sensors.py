@@ -9,8 +9,7 @@ import pytest
 from poses import rigid
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture.format import KaptureData, Sensor
-from megloc_kapture.io.kapture.sensors import read_kapture_data, write_sensors
+from megloc_kapture.io.kapture.sensors import KaptureData, Sensor, read_kapture_data, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
 VERSION = "# kapture format: 1.1\n"
