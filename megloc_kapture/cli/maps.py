@@ -24,11 +24,12 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
+from megloc_kapture.io.csv_table import read_records
 from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
 from megloc_kapture.io.files import reading
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import check_new_file
-from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
+from megloc_kapture.io.tables import CONSISTENCY_FILE, ConsistencyRow
 from megloc_kapture.pipeline.map_making import (
     describe_map,
     options_of_photographs,
@@ -200,5 +201,5 @@ class RefinePoses(Choosing, Working):
             )
         print(f"{counts_text(counts)}; status.csv and refinement.csv in {self.output}")
         if (table := self.output / CONSISTENCY_FILE).is_file():
-            for row in read_consistency(table):
+            for row in read_records(table, ConsistencyRow):
                 print(consistency_sentence(row))

@@ -15,6 +15,7 @@ from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.io import tables
 from megloc_kapture.io.colmap_model import read_colmap_model
+from megloc_kapture.io.csv_table import read_records
 from megloc_kapture.io.dataset_tables import (
     METRES,
     NO_TABLES,
@@ -119,7 +120,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
         frames={image: g.frame for image, g in side_tables.groups.items() if g.frame},
         refinements=_if_there(_read_refinement, folder / tables.REFINEMENT_FILE) or {},
-        consistency=_if_there(tables.read_consistency, folder / tables.CONSISTENCY_FILE) or (),
+        consistency=read_records(folder / tables.CONSISTENCY_FILE, ConsistencyRow, missing_ok=True),
         unit=unit_of(result),
     )
 

@@ -111,6 +111,15 @@ def columns_of(record: Callable[..., Any]) -> tuple[str, ...]:
     return tuple(inspect.signature(record).parameters)
 
 
+def write_records(path: Path | str, record: Callable[..., Any], rows: Iterable[object]) -> None:
+    """Write records of a dataclass, floats with six digits; :func:`read_records` reads them."""
+    cells = (
+        [f"{v:.6g}" if isinstance(v, float) and v == v else v for v in vars(row).values()]
+        for row in rows
+    )
+    write_csv_table(path, columns_of(record), cells)
+
+
 _validator = lru_cache(TypeAdapter)
 
 

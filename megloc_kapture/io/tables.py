@@ -37,6 +37,7 @@ from megloc_kapture.io.csv_table import (
     read_csv_table,
     read_records,
     write_csv_table,
+    write_records,
 )
 from megloc_kapture.io.files import reading
 from megloc_kapture.values import Fallback, LocalizationResult, Pose, PoseRefinement, RigidTransform
@@ -245,18 +246,6 @@ class ConsistencyRow:
     reason: str
 
 
-def read_consistency(path: Path) -> list[ConsistencyRow]:
-    return read_records(path, ConsistencyRow)
-
-
-def write_consistency(path: Path, rows: Iterable[ConsistencyRow]) -> None:
-    write_csv_table(path, columns_of(ConsistencyRow), map(_rounded, rows))
-
-
-def _rounded(row: object) -> list[object]:
-    return [f"{v:.6g}" if isinstance(v, float) and v == v else v for v in vars(row).values()]
-
-
 @dataclass(frozen=True)
 class DepthRow:
     """One row of ``reconstruction/depth.csv``: stereo depth of a map image.
@@ -272,14 +261,6 @@ class DepthRow:
     far_m: float
     fill: float
     reason: str
-
-
-def read_depth_rows(path: Path) -> list[DepthRow]:
-    return read_records(path, DepthRow)
-
-
-def write_depth_rows(path: Path, rows: Iterable[DepthRow]) -> None:
-    write_csv_table(path, columns_of(DepthRow), map(_rounded, rows))
 
 
 @dataclass(frozen=True)
@@ -310,4 +291,4 @@ def append_match_counts(features_dir: Path, type_name: str, counts: Iterable[Pai
 
 def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
     path = match_counts_path(features_dir, type_name)
-    write_csv_table(path, columns_of(PairCount), (vars(count).values() for count in counts))
+    write_records(path, PairCount, counts)

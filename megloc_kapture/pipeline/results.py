@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from megloc_kapture.errors import DataError, check_option
 from megloc_kapture.evaluation.pose_files import COLUMNS
+from megloc_kapture.io.csv_table import write_records
 from megloc_kapture.io.dataset_tables import METRES, write_unit
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.io.tables import CONSISTENCY_FILE, status_row, write_consistency
+from megloc_kapture.io.tables import CONSISTENCY_FILE, ConsistencyRow, status_row
 from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query
@@ -107,7 +108,7 @@ class Results(Mapping[str, Pose | Failure]):
         if (unit := self.localizer.map.unit) != METRES:
             write_unit(output, unit)
         if tested := self.localizer.refiners.tested():
-            write_consistency(output / CONSISTENCY_FILE, tested)
+            write_records(output / CONSISTENCY_FILE, ConsistencyRow, tested)
         return counts
 
     def to_pandas(self) -> pd.DataFrame:

@@ -18,6 +18,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import MeglocError, require
 from megloc_kapture.geometry.cameras import focal_px
+from megloc_kapture.io.csv_table import write_records
 from megloc_kapture.io.dataset_tables import (
     NO_TABLES,
     SIDE_TABLES,
@@ -28,7 +29,7 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import link_images, link_records, remove, safe_join
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.io.tables import DepthRow, write_depth_rows
+from megloc_kapture.io.tables import DepthRow
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.depth import lift_with_covariances
 from megloc_kapture.mvs.views import (
@@ -171,7 +172,7 @@ def densify_map(
     link_images(source.root, output, ("masks",))
     copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
-    write_depth_rows(output / DEPTH_FILE, rows)
+    write_records(output / DEPTH_FILE, DepthRow, rows)
     return {
         "images": len(rows),
         "images_with_depth": len(fills),

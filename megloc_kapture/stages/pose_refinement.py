@@ -16,6 +16,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
+from megloc_kapture.io.csv_table import write_records
 from megloc_kapture.io.dataset_tables import (
     METRES,
     NO_TABLES,
@@ -34,7 +35,6 @@ from megloc_kapture.io.tables import (
     ConsistencyRow,
     read_covariances,
     read_status,
-    write_consistency,
 )
 from megloc_kapture.plugin_loading import AUTO, NetworkOptions, load_chosen
 from megloc_kapture.plugins import (
@@ -298,7 +298,7 @@ def refine_poses(
         shutil.copyfile(clusters, output / CLUSTERS_FILE)
     tested = refiners.tested()
     if tested:
-        write_consistency(output / CONSISTENCY_FILE, tested)
+        write_records(output / CONSISTENCY_FILE, ConsistencyRow, tested)
     if timing is not None:
         write_timing(timing, refined)
     counts: dict[str, float] = {"queries": len(poses)}

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import require
+from megloc_kapture.io.csv_table import read_records
 from megloc_kapture.io.files import safe_join
 from megloc_kapture.io.kapture import (
     KaptureData,
@@ -29,7 +30,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
 )
 from megloc_kapture.io.kapture.points import write_ply
-from megloc_kapture.io.tables import read_depth_rows
+from megloc_kapture.io.tables import DepthRow
 from megloc_kapture.mvs.views import (
     TOLERANCE_PX,
     agreeing_views,
@@ -149,7 +150,7 @@ def fuse_depth(
     """
     path = densified.root / DEPTH_FILE
     require(path.is_file(), "no densified map: reconstruction/depth.csv is missing", path=path)
-    rows = sorted(read_depth_rows(path), key=lambda row: row.image)
+    rows = sorted(read_records(path, DepthRow), key=lambda row: row.image)
     images = {row.image: row.sources for row in rows if not row.reason}
     jobs = [
         (image, [other for other in others if other < image and other in images])

@@ -10,14 +10,12 @@ import pandas as pd
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import read_csv_table, write_csv_table
+from megloc_kapture.io.csv_table import read_csv_table, read_records, write_csv_table, write_records
 from megloc_kapture.io.tables import (
     ConsistencyRow,
-    read_consistency,
     read_refinement,
     read_status,
     write_clusters,
-    write_consistency,
     write_refinement,
     write_status,
 )
@@ -117,9 +115,9 @@ def test_the_consistency_table_reads_back_with_empty_cells_for_unknown_values(
     path = tmp_path / "map_consistency.csv"
     rows = [ROW, replace(ROW, frame="", reason="the depth maps, of one scan, disagree")]
     unknown = ConsistencyRow("", "rendering", 0, 0, *6 * [float("nan")], "no depth")
-    write_consistency(path, [*rows, unknown])
+    write_records(path, ConsistencyRow, [*rows, unknown])
     assert path.read_text().splitlines()[-1] == ",rendering,0,0,,,,,,,no depth"
-    *measured, last = read_consistency(path)
+    *measured, last = read_records(path, ConsistencyRow)
     assert measured == rows and last.reason == "no depth" and last.moved_m != last.moved_m
 
 

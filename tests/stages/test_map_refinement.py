@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project, scaled_camera
+from megloc_kapture.io.csv_table import read_records
 from megloc_kapture.io.dataset_tables import ImageGroup, SideTables
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import (
@@ -34,7 +35,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.tables import read_depth_rows
+from megloc_kapture.io.tables import DepthRow
 from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
 from megloc_kapture.plugins import PluginChoice
@@ -110,7 +111,8 @@ def test_fused_points_are_fewer_than_pixels_with_depth(
     densified: KaptureFolder, tmp_path: Path
 ) -> None:
     count = fuse_depth(densified, tmp_path / "cloud.ply")
-    filled = sum(row.fill for row in read_depth_rows(densified.root / DEPTH_FILE)) * 200 * 150
+    rows = read_records(densified.root / DEPTH_FILE, DepthRow)
+    filled = sum(row.fill for row in rows) * 200 * 150
     assert 0.2 * filled < count < 0.95 * filled  # surfaces in two images are fused
 
 
@@ -180,7 +182,7 @@ def test_images_with_depth_keep_it_and_missing_files_have_a_reason(
     counts = densify_map(KaptureFolder(root), tmp_path / "out", options)
 
     assert counts["images_with_depth"] == 3 and counts["points_lifted"] == 0
-    rows = {row.image: row for row in read_depth_rows(tmp_path / "out" / DEPTH_FILE)}
+    rows = {row.image: row for row in read_records(tmp_path / "out" / DEPTH_FILE, DepthRow)}
     assert rows[missing].reason == "no image file"
     assert rows[measured].reason == "already has depth"
     assert all(missing not in row.sources for row in rows.values())

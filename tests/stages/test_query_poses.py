@@ -18,6 +18,7 @@ from megloc_kapture.errors import PluginError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
+from megloc_kapture.io.csv_table import read_records
 from megloc_kapture.io.dataset_tables import ImageGroup, SideTables
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.images import read_image_rgb
@@ -28,7 +29,7 @@ from megloc_kapture.io.tables import (
     COVARIANCE_FILE,
     POSES_FILE,
     STATUS_FILE,
-    read_consistency,
+    ConsistencyRow,
     read_covariances,
     read_refinement,
     read_status,
@@ -379,7 +380,7 @@ def test_each_coordinate_frame_has_its_consistency(folders: Any, tmp_path: Path)
     assert (first.accepted, second.accepted) == (True, False) and second.reason in text["b.png"]
     poses = KaptureFolder(out).read().poses()
     assert poses["a.png"] == SHIFT and poses["b.png"] == RigidTransform.identity()
-    bad, good = read_consistency(out / CONSISTENCY_FILE)
+    bad, good = read_records(out / CONSISTENCY_FILE, ConsistencyRow)
     assert (bad.frame, bad.images, bad.contradicting) == ("bad", 6, 6)
     assert (good.frame, good.contradicting, good.reason) == ("good", 0, "")
     assert consistency_sentence(good).startswith("sure in good is used; 6 held-out map images")
