@@ -25,7 +25,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.csv_table import read_records
-from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
+from megloc_kapture.io.dataset_tables import read_tables_of, unit_of, write_unit
 from megloc_kapture.io.files import reading
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import check_new_file
@@ -97,7 +97,7 @@ class RefineMap(Reading, Choosing, Working):
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             refine_map(source, out, options, tables=read_tables_of(source.root), work=work)
-            keep_unit(source.root, out)
+            write_unit(out, unit_of(source.root))
         for row in report_lines(self.output):
             self.say(row)
 
@@ -154,7 +154,7 @@ class Densify(Reading, Choosing, Working):
             counts = densify_map(
                 source, out, options, tables=read_tables_of(source.root), work=work
             )
-            keep_unit(source.root, out)
+            write_unit(out, unit_of(source.root))
             self.say(counts_text(counts))
             if self.fuse is not None:
                 tolerance_px = fitted_to_poses(source, options.max_size_px).tolerance_px

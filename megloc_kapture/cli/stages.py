@@ -29,7 +29,7 @@ from megloc_kapture.cli.common import (
     kapture_map,
 )
 from megloc_kapture.errors import OptionError, check_option, require
-from megloc_kapture.io.dataset_tables import keep_unit, read_tables_of
+from megloc_kapture.io.dataset_tables import read_tables_of, unit_of, write_unit
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.kapture.features import features_dir_hint
 from megloc_kapture.io.output_folders import check_new_file
@@ -195,7 +195,7 @@ class Triangulate(Reading, Choosing, Working):
                 pairs=pairs,
                 num_threads=work.num_threads,
             )
-            keep_unit(mapping.root, out)
+            write_unit(out, unit_of(mapping.root))
         self.say(counts_text(counts))
 
 
@@ -451,7 +451,7 @@ class Preprocess(Computing, Working):
         sequences = [KaptureFolder(path) for path in self.sequence]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             counts = preprocess_images(source, out, options, sequences=sequences, work=work)
-            keep_unit(source.root, out)
+            write_unit(out, unit_of(source.root))
         self.say(f"{counts['images']} images, {counts['images_changed']} of them changed")
         for name, share in counts.items():
             if name.startswith("masked_"):

@@ -334,20 +334,14 @@ def read_tables_of(root: Path | str) -> SideTables:
 
 
 def write_unit(root: Path, unit: str) -> None:
-    """Write the tables that state the unit of a kapture folder."""
-    write_protocol(root / SIDE_TABLES, Protocol())
-    write_world(root / SIDE_TABLES, World(unit=unit))
+    """Write the tables that state the unit of a kapture folder, if it is not metres."""
+    if unit != METRES:
+        write_side_tables(root / SIDE_TABLES, SideTables(world=World(unit=unit)))
 
 
 def unit_of(root: Path | str) -> str:
     """Return the unit of a map, or of results localized in a map: m or :data:`NO_METRES`."""
     return read_tables_of(root).world.unit
-
-
-def keep_unit(source: Path, output: Path) -> None:
-    """Write the unit of ``source`` into the output of a command, which may lie elsewhere."""
-    if (unit := unit_of(source)) != METRES:
-        write_unit(output, unit)
 
 
 def write_world(folder: Path | str, world: World) -> None:

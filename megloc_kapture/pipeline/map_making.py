@@ -29,7 +29,6 @@ from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_file
 from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
-    METRES,
     NO_METRES,
     SIDE_TABLES,
     UNREGISTERED_FILE,
@@ -285,8 +284,7 @@ def import_colmap(
     mapped again with the model's poses and the default preset.
     """
     read = ColmapReconstruction.read(source)
-    if unit != METRES:
-        write_unit(output, unit)
+    write_unit(output, unit)
     if source.images is None and source.database is None and not len(read.model.points):
         _log.warning(
             "%s has no points, no images and no database: it becomes a kapture folder of poses, "

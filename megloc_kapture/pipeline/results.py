@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from megloc_kapture.errors import DataError, check_option
 from megloc_kapture.evaluation.pose_files import COLUMNS
 from megloc_kapture.io.csv_table import write_records
-from megloc_kapture.io.dataset_tables import METRES, write_unit
+from megloc_kapture.io.dataset_tables import write_unit
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, ConsistencyRow, status_row
@@ -105,8 +105,7 @@ class Results(Mapping[str, Pose | Failure]):
             output, self.queries.data(), self.values(), fallback=fallback, first_candidates=best
         )
         self.queries.write_images(output)
-        if (unit := self.localizer.map.unit) != METRES:
-            write_unit(output, unit)
+        write_unit(output, self.localizer.map.unit)
         if tested := self.localizer.refiners.tested():
             write_records(output / CONSISTENCY_FILE, ConsistencyRow, tested)
         return counts
