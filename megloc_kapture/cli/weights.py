@@ -83,8 +83,8 @@ class Fetch(Common):
         wanted, refused = [], []
         for name in names:
             weights = lookup(name)
-            if weights.to_fetch is None and (path := next(files_of(weights), None)):
-                print(f"{name}: already present, {path}")
+            if weights.to_fetch is None and (present := next(files_of(weights), None)):
+                print(f"{name}: already present, {present.path}")
                 continue
             try:
                 wanted.append(_fetchable(weights, self.accept_licence))
@@ -217,7 +217,7 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
 
 def _wrong(weights: Weights) -> int:
     """Print the state of each file of a network; return the number of problems."""
-    files = [describe(weights.name, path) for path in files_of(weights)]
+    files = list(files_of(weights))
     problems = [] if files else [how_to_get(weights)]
     for file in files:
         try:
@@ -243,7 +243,7 @@ def _state(weights: Weights) -> str:
 
 
 def _row(weights: Weights) -> dict[str, str]:
-    present = [describe(weights.name, path).published for path in files_of(weights)]
+    present = [file.published for file in files_of(weights)]
     file = next(
         (candidate for candidate in weights.files if candidate in present), weights.files[0]
     )

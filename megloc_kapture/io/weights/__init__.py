@@ -134,16 +134,7 @@ class WeightsFile:
     path: Path
     size: int  # bytes
     mtime_ns: int
-
-    @property
-    def published(self) -> PublishedFile | None:
-        """The published file that this should be; None for user files and converted files."""
-        known = registry().get(self.name)
-        if known is None or self.path.is_relative_to(weights_folder() / UNVERIFIED):
-            return None
-        path = self.path.as_posix()
-        files = (file for file in known.files if any(path.endswith("/" + n) for n in file.names))
-        return next(files, None)
+    published: PublishedFile | None = None  # that this must be; None: a user's or converted file
 
 
 def weights_folder() -> Path:
@@ -155,11 +146,10 @@ def weights_folder() -> Path:
 def find_weights(name: str) -> WeightsFile:
     """Find the checkpoint of a registered network, or a user's file by path."""
     if name in registry():
-        weights = registry()[name]
-        path = next(files_of(weights), None)
-        if path is None:
-            raise MissingWeightsError(how_to_get(weights), names=[name])
-        return describe(weights.name, path)
+        file = next(files_of(registry()[name]), None)
+        if file is None:
+            raise MissingWeightsError(how_to_get(registry()[name]), names=[name])
+        return file
     path = Path(name).expanduser()
     if not path.is_file():
         raise MissingWeightsError(
@@ -187,10 +177,14 @@ def all_missing(errors: Iterable[MissingWeightsError]) -> MissingWeightsError:
     return MissingWeightsError("\n".join(by_line), names=list(names))
 
 
-def files_of(weights: Weights) -> Iterator[Path]:
+def files_of(weights: Weights) -> Iterator[WeightsFile]:
     """Yield a network's readable files, the preferred one first."""
-    names = [name for file in weights.files if not file.convert for name in file.names]
-    yield from _in_folder([*names, weights.converted])
+    for published in weights.files:
+        for path in () if published.convert else _in_folder(published.names):
+            is_users = path.is_relative_to(weights_folder() / UNVERIFIED)
+            yield describe(weights.name, path, None if is_users else published)
+    for path in _in_folder([weights.converted]):
+        yield describe(weights.name, path)
 
 
 def to_convert(weights: Weights) -> Path | None:
@@ -228,10 +222,10 @@ def how_to_convert(weights: Weights, path: Path | str) -> str:
     return f"python scripts/convert_weights.py {weights.name} {path}"
 
 
-def describe(name: str, path: Path) -> WeightsFile:
+def describe(name: str, path: Path, published: PublishedFile | None = None) -> WeightsFile:
     with reading(path):
         state = path.stat()
-    return WeightsFile(name, path, state.st_size, state.st_mtime_ns)
+    return WeightsFile(name, path, state.st_size, state.st_mtime_ns, published)
 
 
 @lru_cache(maxsize=256)
@@ -250,7 +244,7 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     of one machine share the memory; ``nets.runtime.load_strictly`` recognises such tensors by
     ``is_shared_file`` and does not copy them.
     """
-    check_sha256(file, file.published)
+    _check_sha256(file)
     if _is_safetensors(file.path):
         from safetensors.torch import load_file
 
@@ -269,8 +263,8 @@ def _is_safetensors(path: Path) -> bool:
         return file.read(9)[8:] == b"{"
 
 
-def check_sha256(file: WeightsFile, published: PublishedFile | None) -> None:
-    """Raise DataError if the sha256 of the published file is known and differs."""
+def _check_sha256(file: WeightsFile) -> None:
+    published = file.published
     if published and published.sha256 and sha256_of(file) != published.sha256:
         raise DataError(
             f"is not the published {published.name} of {file.name}: sha256 {sha256_of(file)} "
@@ -363,23 +357,22 @@ def add_weights(
 
     An ``unverified`` file may differ from the published one and is used only if that is absent.
     """
-    described = describe(source.name, source)
-    sha256 = sha256_of(described)
+    sha256 = sha256_of(describe(source.name, source))
     weights, target = _recognised(source, sha256, name)
     expected = next((f for f in weights.files if f.name == target), None)
     if expected is not None and expected.convert:
         command = how_to_convert(weights, source)
         raise DataError(f"cannot be read as is; convert it once: {command}", path=source)
-    check_sha256(describe(weights.name, source), None if unverified else expected)
-    read_weights(described)
+    published = None if unverified else expected
+    read_weights(describe(weights.name, source, published))
     path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
     if path.exists() and not force:
-        if sha256_of(describe(weights.name, path)) == sha256:
-            return describe(weights.name, path)
-        raise OutputError(f"{path}: a different file exists; -f replaces it")
-    with open(source, "rb") as content, atomic_write(path) as copy:
-        shutil.copyfileobj(content, copy)
-    return describe(weights.name, path)
+        if sha256_of(describe(weights.name, path)) != sha256:
+            raise OutputError(f"{path}: a different file exists; -f replaces it")
+    else:
+        with open(source, "rb") as content, atomic_write(path) as copy:
+            shutil.copyfileobj(content, copy)
+    return describe(weights.name, path, published)
 
 
 def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
