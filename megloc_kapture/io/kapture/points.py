@@ -6,7 +6,6 @@ fills flat arrays.
 
 from __future__ import annotations
 
-import io
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +24,6 @@ from megloc_kapture.io.files import (
     check_relative,
     named,
     reading,
-    write_bytes,
 )
 from megloc_kapture.io.kapture.format import FORMAT_LINE, check_version
 
@@ -223,9 +221,8 @@ def write_point_covariances(root: Path, covariances: NDArray[np.float64]) -> Non
 
     The columns are xx, xy, xz, yy, yz, zz; NaN where unknown.
     """
-    buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(covariances, dtype=np.float64), allow_pickle=False)
-    write_bytes(root / COVARIANCES_FILE, buffer.getvalue())
+    with atomic_write(root / COVARIANCES_FILE) as file:
+        np.save(file, np.ascontiguousarray(covariances, dtype=np.float64), allow_pickle=False)
 
 
 def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] | None:
