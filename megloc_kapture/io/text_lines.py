@@ -93,6 +93,13 @@ _ROW = re.compile(
 )
 
 
+def camera_of(model: str, numbers: Sequence[str]) -> Camera:
+    """Parse width, height and parameters; some scripts write sizes as floats."""
+    width, height, *params = map(float, numbers)
+    require((width % 1, height % 1) == (0, 0), "the image size is not in whole pixels")
+    return Camera(model, int(width), int(height), tuple(params))
+
+
 def find_camera(cameras: Mapping[str, Camera], image: str, path: Path) -> Camera | None:
     """Return the camera of an image by its name and path from a list; None if no row fits.
 
@@ -129,8 +136,6 @@ def read_camera_rows(path: Path) -> dict[str, Camera]:
                 )
             name = check_relative(row["name"].removeprefix("./"))
             require(name not in cameras, f"{name!r} is listed twice")
-            width, height, *params = map(float, fields_of(row["numbers"]))
-            require((width % 1, height % 1) == (0, 0), "the image size is not in whole pixels")
-            cameras[name] = Camera(row["model"], int(width), int(height), tuple(params))
+            cameras[name] = camera_of(row["model"], fields_of(row["numbers"]))
     require(cameras, "no camera in this list", path=path)
     return cameras

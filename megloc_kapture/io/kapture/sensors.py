@@ -17,7 +17,7 @@ from pathlib import Path
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative, find_near, named, remove, write_bytes
 from megloc_kapture.io.kapture.format import check_columns, format_table, read_rows
-from megloc_kapture.io.text_lines import numbers_of
+from megloc_kapture.io.text_lines import camera_of, numbers_of
 from megloc_kapture.values import Camera, RigidTransform
 
 # a quaternion whose length differs from 1 by less than this (few digits in the text) is normalised
@@ -59,11 +59,7 @@ class Sensor:
                 "`megloc localize --query` does so for queries, `megloc map` for map images"
             )
         require(len(self.params) > 2, "expected a camera model, width, height and parameters")
-        model, *texts = self.params
-        width, height, *params = map(float, texts)
-        size = width, height
-        require(size == (int(width), int(height)), f"image size {size} is not in whole pixels")
-        return Camera(model, int(width), int(height), tuple(params))
+        return camera_of(self.params[0], self.params[1:])
 
     @classmethod
     def from_camera(cls, camera: Camera, *, name: str = "", sensor_type: str = "camera") -> Sensor:
