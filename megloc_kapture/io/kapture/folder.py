@@ -56,12 +56,14 @@ class KaptureFolder:
 
     def check_features_apart(self, other: KaptureFolder) -> None:
         """Raise DataError if different images of the same name have the same features in both."""
-        for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
-            if _same_content(self.image_path(image), other.image_path(image)):
-                continue
-            for kind in ARRAY_KINDS:
-                for type_name in sorted(set(self.types(kind)) & set(other.types(kind))):
-                    mine, theirs = (folder.features(kind, type_name) for folder in (self, other))
+        shared = sorted(set(self.read().image_names()) & set(other.read().image_names()))
+        different = [
+            i for i in shared if not _same_content(self.image_path(i), other.image_path(i))
+        ]
+        for kind in ARRAY_KINDS if different else ():
+            for type_name in sorted(set(self.types(kind)) & set(other.types(kind))):
+                mine, theirs = (folder.features(kind, type_name) for folder in (self, other))
+                for image in different:
                     if image in mine and image in theirs and _same_array(mine, theirs, image):
                         raise DataError(
                             f"{image} is another image in {self.root} than in {other.root}, and "
