@@ -188,7 +188,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     return ColmapModel(
         cameras,
         images,
-        _points(model, images) if with_points else SparsePoints.none(),
+        _points(model, images),
         {rig_id: _cams_from_rig(rig) for rig_id, rig in sorted(model.rigs.items())},
         {image_id: image.frame_id for image_id, image in model.images.items()},
     )
