@@ -132,8 +132,9 @@ def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path,
         )
     paths = [folder / name for name in (names if with_points else names[:2])]
     for path in paths:
-        remedy = "; an empty file is a model of poses only" if path.name == "points3D.txt" else ""
-        require(path.is_file(), f"file is missing{remedy}", path=path)
+        reason = "; the points are read from it" if path.stem == "points3D" else ""
+        remedy = " (an empty file: a model of poses only)" if path.name == "points3D.txt" else ""
+        require(path.is_file(), f"file is missing{reason}{remedy}", path=path)
     more = [folder / f"{name}{paths[0].suffix}" for name in _RIG_FILES]
     return (*paths, *(path for path in more if path.exists()))
 

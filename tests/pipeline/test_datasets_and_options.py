@@ -338,7 +338,7 @@ def test_plugins_are_made_with_their_options() -> None:
         options_of_preset(assignments=["matching.name=surf"]).make_matcher("rootsift")
 
 
-MISSING = "3D-models/aachen_v_1_1/points3D.txt: missing"
+MISSING = "3D-models/aachen_v_1_1/points3D.txt: file is missing; the points are read from it"
 
 
 def run_of(dataset: str, preset: str, *assignments: str) -> Run:
