@@ -1,4 +1,4 @@
-"""Compiled loops over a map's observations; import only where called: numba loads slowly."""
+"""Compiled loop over a map's observations; import only where called: numba loads slowly."""
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
 
@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 from numba import get_num_threads
 
 from megloc_kapture.compiling import compiled_loop
@@ -24,43 +23,6 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
     with ThreadPoolExecutor(get_num_threads()) as executor:  # one per available core
         for _ in executor.map(work, starts, [min(first + size, count) for first in starts]):
             pass
-
-
-@compiled_loop
-def most_shared(
-    first, last, starts, of_image, images, track, track_starts, window, min_shared, best
-):
-    """Fill ``best[first:last]`` with the images that share the most points with each image.
-
-    ``best`` is (I, K). Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations
-    are sorted by track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``.
-    At most ``window`` observations of the track before and after an observation are visited.
-    """
-    shared = np.zeros(len(best), np.int64)
-    touched = np.empty(len(best), np.int64)
-    for image in range(first, last):
-        count = 0
-        for k in range(starts[image], starts[image + 1]):
-            observation = of_image[k]
-            begin = max(track_starts[track[observation]], observation - window)
-            end = min(track_starts[track[observation] + 1], observation + window + 1)
-            for i in range(begin, end):
-                other = images[i]
-                if shared[other] == 0:
-                    touched[count] = other
-                    count += 1
-                shared[other] += 1
-        enough = 0
-        for k in range(count):
-            other = touched[k]
-            if other != image and shared[other] >= min_shared:
-                # sort key: most shared first, then the image
-                touched[enough] = (-shared[other] << 32) | other
-                enough += 1
-            shared[other] = 0
-        ranked = np.sort(touched[:enough])
-        for k in range(min(enough, best.shape[1])):
-            best[image, k] = ranked[k] & 0xFFFFFFFF
 
 
 @compiled_loop

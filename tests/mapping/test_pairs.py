@@ -1,4 +1,4 @@
-"""Pairs of images compared with loops over all pairs, and pairs of long tracks."""
+"""Pairs of images compared with loops over all pairs."""
 
 from __future__ import annotations
 
@@ -150,17 +150,6 @@ def test_pairs_by_covisibility_equal_the_sets(
         result = pairs_by_covisibility(num_images, arrays[:, 0], arrays[:, 1], options)
     assert result.dtype == np.int64 and result.shape[1] == 2
     assert result.tolist() == by_sets(num_images, observations, top_k, min_shared_points)
-
-
-def test_images_of_a_long_track_pair_with_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_TRACK_WINDOW", 3)
-    monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 1)
-    options = PairsByCovisibilityOptions(top_k=100)
-    # near in the track, not in the numbers of the images
-    images = 10 * np.arange(9)
-    result = pairs_by_covisibility(100, np.zeros(9, dtype=int), images, options)
-    expected = [[10 * a, 10 * b] for a in range(9) for b in range(a + 1, min(a + 4, 9))]
-    assert result.tolist() == expected
 
 
 def by_loops(
