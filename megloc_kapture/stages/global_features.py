@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,21 +69,6 @@ def vlad_type(local_type: str) -> str:
     return f"vlad_{local_type}"
 
 
-def train_on_map(
-    mapping: KaptureFolder, local_type: str, options: VladOptions, *, work: Work = HERE
-) -> Vocabulary:
-    images = mapping.read().image_names()
-    descriptors = mapping.descriptors(local_type)
-    require(
-        any(descriptors.length(image) for image in images),
-        f"the map has no descriptors of type {local_type}",
-        path=mapping.root,
-    )
-    read = partial(_descriptors, mapping, local_type)
-    each = partial(ordered_map, executor=work.executor)
-    return train_vlad(images, descriptors.length, read, options, each=each)
-
-
 def extract_vlad(
     mapping: KaptureFolder,
     folders: Sequence[KaptureFolder],
@@ -97,36 +81,52 @@ def extract_vlad(
     """Train VLAD on ``mapping`` and write vectors of all images; return the number of images."""
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
-    trained = read_vocabulary(place) if work.resume else None
-    if trained is None:
-        vocabulary = train_on_map(mapping, local_type, options, work=work)
+    if not work.resume or read_vocabulary(place) is None:
+        images, descriptors = mapping.read().image_names(), mapping.descriptors(local_type)
+        require(
+            any(descriptors.length(image) for image in images),
+            f"the map has no descriptors of type {local_type}",
+            path=mapping.root,
+        )
+        read = partial(_descriptors, mapping, local_type)
+        each = partial(ordered_map, executor=work.executor)
+        vocabulary = train_vlad(images, descriptors.length, read, options, each=each)
         write_vocabulary(place, vocabulary, local_type, options)
-    else:
-        vocabulary, _ = trained
-    config = FeatureConfig(type_name, np.dtype(np.float32), vocabulary.size, metric_type="L2")
-    folder_of = images_of(folders, "describe")
-    is_written = partial(has_features, output, "global_features", type_name)
-    todo = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
-    writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
-    describe = partial(_aggregate, local_type, place, uuid4().hex)
-    results = work.map(describe, todo, resumed_label("VLAD", len(folder_of), len(todo)))
-    for (image, _), vector in zip(todo, results, strict=True):
-        writer.write(image, vector)
-    return len(folder_of)
+    describe = partial(_aggregate, local_type, place)
+    return _write_vectors(folders, type_name, output, describe, work, label="VLAD")
 
 
-def _aggregate(local_type: str, place: Path, run_id: str, job: Job) -> NDArray[np.float32]:
-    vocabulary, settings = _read_once(place, run_id)
+def _aggregate(local_type: str, place: Path, job: Job) -> NDArray[np.float32]:
+    stored = read_vocabulary(place)
+    assert stored is not None
+    vocabulary, settings = stored
     image, folder = job
     return aggregate(_descriptors(folder, local_type, image), vocabulary, settings.options)
 
 
-@lru_cache(maxsize=1)
-def _read_once(folder: Path, run_id: str) -> tuple[Vocabulary, VladSettings]:
-    """Read a vocabulary once per process, as it may be too large to send with every image."""
-    vocabulary = read_vocabulary(folder)
-    assert vocabulary is not None
-    return vocabulary
+def _write_vectors(
+    folders: Sequence[KaptureFolder],
+    type_name: str,
+    output: Path,
+    describe: Callable[[Job], NDArray[np.float32]] | Batched[Job, NDArray[np.float32]],
+    work: Work,
+    *,
+    label: str,
+) -> int:
+    """Write vectors of all images (orphan layout); return the number of images."""
+    folder_of = images_of(folders, "describe")
+    is_written = partial(has_features, output, "global_features", type_name)
+    jobs = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
+    jobs.sort(key=size_of)  # images of equal size can share a batch
+    writer: FeatureWriter | None = None
+    results = work.map(describe, jobs, resumed_label(label, len(folder_of), len(jobs)))
+    for (image, _), vector in zip(jobs, results, strict=True):
+        if writer is None:
+            kind = np.dtype(np.float32)
+            config = FeatureConfig(type_name, kind, len(vector), metric_type="L2")
+            writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
+        writer.write(image, vector)
+    return len(folder_of)
 
 
 def write_vocabulary(
@@ -141,15 +141,17 @@ def write_vocabulary(
 
 
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
-    """Read the vocabulary and the settings of a VLAD type; None if they are missing."""
+    """Read the vocabulary and the settings of a VLAD type; None if they are missing.
+
+    The arrays are mapped into memory, where processes share them.
+    """
     if not (folder / SETTINGS_FILE).is_file():
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
-    centres = np.load(folder / VOCABULARY_FILE)
-    if settings.options.dimensions is None:
-        return Vocabulary(centres), settings
-    mean, projection = (np.load(folder / name) for name in (MEAN_FILE, PROJECTION_FILE))
-    return Vocabulary(centres, mean, projection), settings
+    names = [VOCABULARY_FILE]
+    if settings.options.dimensions is not None:
+        names += [MEAN_FILE, PROJECTION_FILE]
+    return Vocabulary(*(np.load(folder / name, mmap_mode="r") for name in names)), settings
 
 
 VLAD = "vlad"
@@ -196,23 +198,11 @@ def extract_global_features(
     work: Work = HERE,
 ) -> int:
     """Write global features of all images (orphan layout); return the number of images."""
-    folder_of = images_of(folders, "describe")
-    is_written = partial(has_features, output, "global_features", extractor.name)
-    jobs = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
-    jobs.sort(key=size_of)  # images of equal size can share a batch
     describe = partial(_describe, extractor)
     steps: Batched[Job, NDArray[np.float32]] = Batched(
         _read, describe, extractor, "describe_many", size_of
     )
-    writer: FeatureWriter | None = None
-    results = work.map(steps, jobs, resumed_label(extractor.name, len(folder_of), len(jobs)))
-    for (image, _), vector in zip(jobs, results, strict=True):
-        if writer is None:
-            kind = np.dtype(np.float32)
-            config = FeatureConfig(extractor.name, kind, len(vector), metric_type="L2")
-            writer = FeatureWriter(output, "global_features", extractor.name, config, orphan=True)
-        writer.write(image, vector)
-    return len(folder_of)
+    return _write_vectors(folders, extractor.name, output, steps, work, label=extractor.name)
 
 
 def describe_images(
