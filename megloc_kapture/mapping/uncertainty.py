@@ -10,13 +10,12 @@ distortion.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.poses import deviation_by_median
 from megloc_kapture.values import Camera, Options, RigidTransform
 
@@ -42,12 +41,12 @@ def point_covariances(
     from megloc_kapture.mapping import kernels
 
     out = np.full((len(xyz), 6), np.nan)
-    starts, image_ids = _by_point(point_ids, image_ids, len(xyz), len(cameras))
     if len(image_ids) == 0:
         return out
+    by_point = np.argsort(point_ids, kind="stable")
     arguments = (
-        starts,
-        image_ids,
+        np.append(0, np.cumsum(np.bincount(point_ids, minlength=len(xyz)))),
+        image_ids[by_point].astype(np.int32),
         np.ascontiguousarray(xyz, dtype=np.float64),
         *packed_views(cameras, cams_from_world),
         out,
@@ -68,23 +67,6 @@ def point_deviations(covariances: Floats) -> Floats:
     return deviations
 
 
-def _by_point(
-    point_ids: NDArray[np.integer], image_ids: NDArray[np.integer], num_points: int, num_images: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Return the first observation of each point (N + 1,), and the images (O,) in that order."""
-    for name, ids, count in (("point", point_ids, num_points), ("image", image_ids, num_images)):
-        if len(ids) and not (ids.min() >= 0 and ids.max() < count):
-            raise DataError(
-                f"observations of {name}s {ids.min()} to {ids.max()}, but there are {count}"
-            )
-    if (point_ids[1:] < point_ids[:-1]).any():
-        order = np.argsort(point_ids, kind="stable")
-        point_ids, image_ids = point_ids[order], image_ids[order]
-    starts = np.zeros(num_points + 1, dtype=np.int64)
-    np.cumsum(np.bincount(point_ids, minlength=num_points), out=starts[1:])
-    return starts, np.ascontiguousarray(image_ids, dtype=np.int32)
-
-
 class UncertaintyOptions(Options):
     """Limit of the points' uncertainty.
 
@@ -101,19 +83,11 @@ class UncertaintyOptions(Options):
     )
 
 
-def rows_by_image(
-    image_ids: NDArray[np.int32], num_images: int
-) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield each image with observations, and their rows in ``image_ids`` (O,), ascending."""
+def rows_of_each(ids: NDArray[np.integer], count: int) -> list[NDArray[np.int64]]:
+    """Return the rows in ``ids`` (O,) of each id from 0 to ``count`` - 1, ascending."""
     # numpy sorts integers of 16 bits in linear time
-    narrow = image_ids.astype(np.uint16) if num_images < 1 << 16 else image_ids
-    order = np.argsort(narrow, kind="stable")
-    begin = 0
-    ends = np.cumsum(np.bincount(image_ids, minlength=num_images))
-    for image, end in enumerate(ends.tolist()):
-        if end > begin:
-            yield image, order[begin:end]
-        begin = end
+    order = np.argsort(ids.astype(np.uint16) if count < 1 << 16 else ids, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(ids, minlength=count))[:-1])
 
 
 def mean_depths(

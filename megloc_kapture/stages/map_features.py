@@ -27,6 +27,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 from megloc_kapture.io.kapture.folder import ARRAY_KINDS
+from megloc_kapture.mapping.uncertainty import rows_of_each
 
 # detector implementations differ by tenths of a pixel
 _MAX_SHIFT_PX = 1.0
@@ -81,11 +82,9 @@ def _moved(
     observations that were transferred. The new keypoint ids are positions among the kept rows.
     """
     stored, extracted = reference.keypoints(local_type), mapping.keypoints(local_type)
-    order = np.argsort(seen.image_ids, kind="stable")
-    ends = np.cumsum(np.bincount(seen.image_ids, minlength=len(seen.image_names)))
     point_ids, image_ids, keypoint_ids = [], [], []
     rows_of, num_found = {}, 0
-    for row, rows in enumerate(np.split(order, ends[:-1])):
+    for row, rows in enumerate(rows_of_each(seen.image_ids, len(seen.image_names))):
         image = seen.image_names[row]
         if len(rows) == 0:
             continue

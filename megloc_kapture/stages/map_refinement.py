@@ -46,7 +46,7 @@ from megloc_kapture.mapping.uncertainty import (
     mean_depths,
     point_covariances,
     point_deviations,
-    rows_by_image,
+    rows_of_each,
     too_uncertain,
 )
 from megloc_kapture.plugins import DepthView
@@ -236,10 +236,11 @@ def _verify_depth(
     once = np.bincount(point_ids[kept], minlength=len(selection.xyz))[point_ids] == 1
     lifted = kept & once & np.isin(selection.image_ids, list(with_depth))
     triangulated = np.flatnonzero(kept & ~lifted)
+    observing = selection.image_ids[triangulated]
     rows_of = [
         (image, triangulated[rows])
-        for image, rows in rows_by_image(selection.image_ids[triangulated], len(selection.images))
-        if image in with_depth
+        for image, rows in enumerate(rows_of_each(observing, len(selection.images)))
+        if image in with_depth and len(rows)
     ]
 
     def job(image: int, rows: NDArray[np.int64]) -> tuple[str, Floats, Floats]:
@@ -304,9 +305,7 @@ def _votes_of_other_scans(
     scan_of = np.full(len(selection.images), -1)
     for number, images in enumerate(scans):
         scan_of[images] = number
-    own_scan = scan_of[selection.image_ids[lifted]]
-    order = np.argsort(own_scan, kind="stable")
-    rows_of_scan = np.split(order, np.searchsorted(own_scan[order], np.arange(1, len(scans))))
+    rows_of_scan = rows_of_each(scan_of[selection.image_ids[lifted]], len(scans))
     judged_rows: list[list[NDArray[np.int64]]] = [[] for _ in scans]
     for rows, others in zip(rows_of_scan, neighbours, strict=True):
         for other in others:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import median_abs_deviation
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.mapping.uncertainty import (
     left_with_too_few,
     mean_depths,
@@ -152,18 +151,6 @@ def test_the_order_of_observations_and_a_far_origin_do_not_matter() -> None:
     moved = [pose @ away for pose in poses]
     far = point_covariances(points + offset, point_ids, image_ids, cameras, moved)
     np.testing.assert_allclose(far, straight, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("point_ids", "image_ids"),
-    [([0, 0], [0, 4]), ([0, 0], [-1, 0]), ([0, 1], [0, 1]), ([-1, 0], [0, 1])],
-)
-def test_ids_that_are_no_rows_are_refused(point_ids: list[int], image_ids: list[int]) -> None:
-    """The compiled loops check no bounds."""
-    point, poses = np.zeros((1, 3)), looking_at_origin(CENTERS)
-    points, images = np.array(point_ids), np.array(image_ids)
-    with pytest.raises(DataError):
-        point_covariances(point, points, images, [FISHEYE] * 4, poses)
 
 
 def test_images_of_the_same_centre_determine_no_points() -> None:
