@@ -147,15 +147,14 @@ def _described(skipped: Mapping[ImageVariant, str]) -> str:
     return "; ".join(f"{' '.join(map(str, some))}: {reason}" for reason, some in by_reason.items())
 
 
-def _counts(before: int = 0, after: int | None = None) -> Counter[str]:
-    """Return counts for the log from a pair's numbers of matches; None: it was not tried."""
-    return Counter(
-        pairs_tried=int(after is not None),
-        pairs_gained=int((after or 0) > before),
-        matches_before=before,
-        matches_after=after or 0,
-        keypoints_added=0,
-    )
+def _counts(tried: Sequence[tuple[int, int]]) -> dict[str, int]:
+    """Return counts for the log from numbers of matches, before and after, of the tried pairs."""
+    return {
+        "pairs_tried": len(tried),
+        "pairs_gained": sum(after > before for before, after in tried),
+        "matches_before": sum(before for before, _ in tried),
+        "matches_after": sum(after for _, after in tried),
+    }
 
 
 def _warn_of_skipped(local_type: str, skipped: Counter[str]) -> None:
@@ -211,13 +210,14 @@ class RetriedQuery:
     """A query after guided pyramid matching.
 
     The added keypoints (A, C) and descriptors (A, D) follow those of the query. ``matches`` are in
-    the order of the candidates. ``skipped`` has the reasons of skipped variants.
+    the order of the candidates. ``tried`` has the numbers of matches, before and after, of the
+    candidates that were matched again, ``skipped`` the reasons of skipped variants.
     """
 
     added_px: NDArray[np.float32]
     added_descriptors: NDArray[Any]
     matches: list[ImageMatches]
-    counts: Counter[str]
+    tried: list[tuple[int, int]]
     skipped: str
 
 
@@ -245,7 +245,7 @@ def retry_query(
     mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
         none = query.keypoints_px[:0], query.descriptors[:0]
-        return RetriedQuery(*none, list(matches), _counts(), "")
+        return RetriedQuery(*none, list(matches), [], "")
     assert not isinstance(verification, KnownPoseOptions)
 
     def judge(other: str, features: Features) -> PairVerifier:
@@ -260,18 +260,16 @@ def retry_query(
     of_other = dict(zip(hard, matched, strict=True))
     keypoints = KeypointUnion(query.keypoints_px)
     richer: list[ImageMatches] = []
-    counts = _counts()
+    tried = []
     for other, pairs, scores in matches:
         if other in of_other:
             variants = [(0, each) for each in of_other[other]]
-            before = len(pairs)
             pairs, scores = combine((pairs, scores), variants, mode, [keypoints])
-            counts.update(_counts(before, len(pairs)))
+            tried.append((len(base[other]), len(pairs)))
         richer.append((other, pairs, scores))
     added = np.array(keypoints.descriptors, query.descriptors.dtype)
     added = added.reshape(-1, query.descriptors.shape[1])
-    counts["keypoints_added"] = len(added)
-    return RetriedQuery(keypoints.added(), added, richer, counts, skipped)
+    return RetriedQuery(keypoints.added(), added, richer, tried, skipped)
 
 
 _Pair = tuple[str, str]
@@ -320,7 +318,7 @@ def pyramid_mapping(
         for other, of_pair in zip(chain(*names), of_pairs, strict=True):
             matched_of[image, other] = of_pair, skipped
     unions: dict[str, KeypointUnion] = {}
-    counts, reasons, hard_pairs = _counts(), Counter[str](), set(hard)
+    tried, reasons, hard_pairs = [], Counter[str](), set(hard)
     writer = MatchesWriter(output, pyramid_type(local_type), orphan=True)
     for pair in named:
         matches, scores = stored.read(*pair)
@@ -332,23 +330,21 @@ def pyramid_mapping(
             for image in set(pair) - unions.keys():
                 unions[image] = KeypointUnion(keypoints.read(image))
             both = unions[pair[0]], unions[pair[1]]
-            before = len(matches)
             matches, scores = combine((matches, scores), variants, mode, both)
+            tried.append((verified[pair], len(matches)))
             reasons[" | ".join(reason for _, reason in directed if reason)] += 1
-            counts.update(_counts(before, len(matches)))
         writer.write(*pair, matches, scores)
-    extended = sorted(image for image, union in unions.items() if union.descriptors)
-    for image in extended:
-        descriptors = np.stack(unions[image].descriptors)
-        counts["keypoints_added"] += len(descriptors)
-        features.write(image, unions[image].added(), descriptors)
+    extended = {image: union for image, union in sorted(unions.items()) if union.descriptors}
+    for image, union in extended.items():
+        features.write(image, union.added(), np.stack(union.descriptors))
     features.write_rest()
     _warn_of_skipped(local_type, reasons)
     return {
         "images_extracted_again": len(jobs),
         "images_extended": len(extended),
         "pairs": len(named),
-        **counts,
+        **_counts(tried),
+        "keypoints_added": sum(len(union.descriptors) for union in extended.values()),
     }
 
 
@@ -416,25 +412,27 @@ def pyramid_queries(
     features = PyramidFeatures(output, query, local_type)
     retry = partial(_retry, query, mapping, types, method)
     plugins = method.extractor, method.matcher
-    counts, skipped = _counts(), Counter[str]()
-    retried = extended = 0
+    tried, skipped = list[tuple[int, int]](), Counter[str]()
+    retried = extended = added = 0
     writer = MatchesWriter(output, larger, orphan=True)
     results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
     for (image, *_), result in zip(jobs, results, strict=True):
         for matches in result.matches:
             writer.write(image, *matches)
         features.write(image, result.added_px, result.added_descriptors)
-        counts.update(result.counts)
-        skipped[result.skipped] += result.counts["pairs_tried"]
-        retried += result.counts["pairs_tried"] > 0
+        tried += result.tried
+        skipped[result.skipped] += len(result.tried)
+        retried += len(result.tried) > 0
         extended += len(result.added_px) > 0
+        added += len(result.added_px)
     features.write_rest()
     _warn_of_skipped(local_type, skipped)
     return {
         "images_extracted_again": retried,
         "images_extended": extended,
-        "pairs": sum(map(len, candidates.values())),
-        **counts,
+        "pairs": len(both),
+        **_counts(tried),
+        "keypoints_added": added,
     }
 
 
@@ -495,8 +493,9 @@ class _Rematching(PipelineStage):
             name = extractor.name
             rows = read_match_counts(work.path(self.matches), name)
             if second_matcher is not None:
+                named = {(p.query, p.map) if self.of_queries else one_way(p) for p in pairs}
                 chosen = pairs_to_rematch(
-                    {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
+                    {pair: rows[pair].verified for pair in named & rows.keys()},
                     options.second_matching,
                     of_both=not self.of_queries,
                 )
@@ -519,11 +518,6 @@ class _Rematching(PipelineStage):
                 retried = retry(pairs, name, method, out, num_found=num_found, work=work)
                 counts |= {f"{name} {key}": count for key, count in retried.items()}
         return counts
-
-
-def _named(pairs: Sequence[ImagePair]) -> set[_Pair]:
-    """Return the names of the pairs in both orders; within a map, only one order is stored."""
-    return {names for p in pairs for names in ((p.query, p.map), (p.map, p.query))}
 
 
 class RematchMapping(_Rematching):

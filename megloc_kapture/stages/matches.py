@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from itertools import combinations, groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,12 +166,8 @@ def match_pairs(
     for image, group in groupby(todo, key=itemgetter(0)):
         jobs += [(image, some) for some in batched((b for _, b in group), _PAIRS_PER_ITEM)]
     folders = first, second
-    read = partial(_read, folders, local_type)
     verify = partial(_verify, folders, local_type, verification)
-    match: Any = partial(_match, matcher)
-    steps: Batched[_Job, list[VerifiedMatches]] = Batched(
-        read, match, matcher, "match_many", None, verify
-    )
+    steps = _matching(folders, local_type, matcher, verify)
     results = work.map(steps, jobs, resumed_label("matching", len(ordered), len(todo)))
     for (image, others), verified_pairs in zip(jobs, results, strict=True):
         new_counts = [
@@ -224,12 +220,8 @@ def check_given_poses(
     Log a warning if some poses contradict the matches. If most do, raise DataError unless
     ``work.force``.
     """
-    read = partial(_read, (mapping, mapping), local_type)
     finish = partial(_evidence, mapping, local_type)
-    match: Any = partial(_match, matcher)
-    steps: Batched[_Job, list[PairEvidence]] = Batched(
-        read, match, matcher, "match_many", None, finish
-    )
+    steps = _matching((mapping, mapping), local_type, matcher, finish)
     evidence = work.map(steps, _sampled(pairs), "checking the given poses")
     contradiction = pose_contradiction([pair for of_image in evidence for pair in of_image])
     if contradiction is None:
@@ -291,11 +283,20 @@ def _evidence(
 
 _Job = tuple[str, Sequence[str]]  # an image of the first folder, and some of the second
 _Folders = tuple[KaptureFolder, KaptureFolder]
+_Result = TypeVar("_Result")
 
 
 def one_way(pair: ImagePair) -> tuple[str, str]:
     """Return the names of a pair of map images in the order in which it is stored."""
     return min(pair.query, pair.map), max(pair.query, pair.map)
+
+
+def _matching(
+    folders: _Folders, local_type: str, matcher: Matcher, finish: Callable[..., list[_Result]]
+) -> Batched[_Job, list[_Result]]:
+    """Return the steps that match an image with others; ``finish`` judges the matches."""
+    match: Any = partial(_match, matcher)
+    return Batched(partial(_read, folders, local_type), match, matcher, "match_many", None, finish)
 
 
 def _read(folders: _Folders, local_type: str, job: _Job) -> list[Features]:
@@ -344,13 +345,7 @@ def match_all(
     def match(batch: Sequence[ImageFeatures]) -> Sequence[_PairMatches]:
         return many.match_many(a, batch) if len(batch) > 1 else [matcher.match(a, batch[0])]
 
-    pairs = in_batches(
-        matcher,
-        "match_many",
-        match,
-        others,
-        name=names.__getitem__,
-    )
+    pairs = in_batches(matcher, "match_many", match, others, name=names.__getitem__)
     for pair, other, name in zip(pairs, others, names, strict=True):
         who = f"matcher {type(matcher).__name__} on {name}"
         if not isinstance(pair, tuple | list) or len(pair) != 2:
@@ -377,29 +372,22 @@ def verified(
 
     Verification by known poses rejects every match if the relative pose is unknown.
     """
+
+    def are_correct(matches: NDArray[np.int64]) -> NDArray[np.bool_]:
+        rows_a, rows_b = matches.T
+        if verification is None:
+            return np.ones(len(matches), dtype=bool)
+        if isinstance(verification, TwoViewOptions):
+            points_px = a.keypoints_px[rows_a, :2], b.keypoints_px[rows_b, :2]
+            return verify_two_view(points_px[0], a.camera, points_px[1], b.camera, verification)
+        if b_from_a is None:
+            return np.zeros(len(matches), dtype=bool)
+        rays = a.rays[rows_a], a.slopes[rows_a], b.rays[rows_b], b.slopes[rows_b]
+        return verify_with_poses(*rays, b_from_a, verification)
+
     matches, scores = pair
-    good = verify_best_first(partial(_are_correct, a, b, verification, b_from_a), matches, scores)
+    good = verify_best_first(are_correct, matches, scores)
     return VerifiedMatches(matches[good], scores[good], len(matches))
-
-
-def _are_correct(
-    a: Features,
-    b: Features,
-    verification: Verification,
-    b_from_a: RigidTransform | None,
-    matches: NDArray[np.int64],
-) -> NDArray[np.bool_]:
-    """Return the mask (K,) of the correct matches (K, 2), which are best first."""
-    rows_a, rows_b = matches.T
-    if verification is None:
-        return np.ones(len(matches), dtype=bool)
-    if isinstance(verification, TwoViewOptions):
-        points_px = a.keypoints_px[rows_a, :2], b.keypoints_px[rows_b, :2]
-        return verify_two_view(points_px[0], a.camera, points_px[1], b.camera, verification)
-    if b_from_a is None:
-        return np.zeros(len(matches), dtype=bool)
-    rays = a.rays[rows_a], a.slopes[rows_a], b.rays[rows_b], b.slopes[rows_b]
-    return verify_with_poses(*rays, b_from_a, verification)
 
 
 @lru_cache(maxsize=8)
