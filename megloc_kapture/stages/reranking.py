@@ -83,16 +83,13 @@ def rerank(
     """
     num = len(of_types[0]) if of_types else 0
     if options.by == "coverage":
-        rows = [[np.unique(np.asarray(matched)) for matched in type_rows] for type_rows in of_types]
-        # keypoints are numbered consecutively across types
-        sizes = [
-            max((int(ids[-1]) + 1 for ids in type_rows if len(ids)), default=0)
-            for type_rows in rows
-        ]
-        starts = np.cumsum([0, *sizes[:-1]])
+        # keypoint k of type t gets a number of its own, k * (number of types) + t
         keypoints = [
             np.concatenate(
-                [start + type_rows[at] for start, type_rows in zip(starts, rows, strict=True)]
+                [
+                    np.unique(np.asarray(type_rows[at])) * len(of_types) + number
+                    for number, type_rows in enumerate(of_types)
+                ]
             )
             for at in range(num)
         ]

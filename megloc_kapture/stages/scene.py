@@ -166,22 +166,16 @@ def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
     With ``rigs`` a unit is the images of one rig at one timestamp; a camera on several rigs belongs
     to the first by name.
     """
-    carried = _carried(data) if rigs else {}
-    rigs_of = _rigs_of(carried)
-    units: list[Unit] = []
-    together: dict[tuple[int, str], list[str]] = {}
+    mounts, same = _mounts(data) if rigs else {}, RigidTransform.identity()
+    together: dict[str | tuple[int, str], list[tuple[str, RigidTransform]]] = {}
     for image in data.image_names():
         timestamp, sensor = data.record_of(image)
-        if sensor in rigs_of:
-            together.setdefault((timestamp, rigs_of[sensor][0]), []).append(image)
+        if sensor in mounts:
+            rig, cam_from_rig = next(iter(mounts[sensor].items()))
+            together.setdefault((timestamp, rig), []).append((image, cam_from_rig))
         else:
-            units.append(((image, RigidTransform.identity()),))
-    for (_, rig), images in together.items():
-        if len(images) == 1:
-            units.append(((images[0], RigidTransform.identity()),))
-        else:
-            members = carried[rig]
-            units.append(tuple((image, members[data.record_of(image)[1]]) for image in images))
+            together[image] = [(image, same)]
+    units = [tuple(unit) if len(unit) > 1 else ((unit[0][0], same),) for unit in together.values()]
     return sorted(units, key=lambda unit: [image for image, _ in unit])
 
 
@@ -189,23 +183,17 @@ def poses_through_rig(
     data: KaptureData, localized: Mapping[str, Pose]
 ) -> dict[str, tuple[str, RigidTransform]]:
     """Derive poses of unlocalized images from the rig sibling with the most inliers."""
-    carried = _carried(data)
-    rigs_of = _rigs_of(carried)
-    at_time: dict[int, list[tuple[str, str]]] = {}
-    for (timestamp, sensor), image in data.records_camera.items():
-        at_time.setdefault(timestamp, []).append((sensor, image))
+    siblings = _siblings_on_rig(data, data.records_camera)
     guesses = {}
     for image in sorted(set(data.records_camera.values()) - set(localized)):
-        timestamp, sensor = data.record_of(image)
         poses = [
-            (-result.num_inliers, other, sensor_from_other @ result.cam_from_world)
-            for other_sensor, other in at_time[timestamp]
-            if (result := localized.get(other)) is not None
-            and (sensor_from_other := _between(carried, rigs_of, sensor, other_sensor)) is not None
+            (-pose.num_inliers, other, sensor_from_other @ pose.cam_from_world)
+            for _, other, sensor_from_other in siblings(*data.record_of(image))
+            if (pose := localized.get(other)) is not None
         ]
         if poses:
-            _, other, pose = min(poses, key=itemgetter(0, 1))
-            guesses[image] = (other, pose)
+            _, other, cam_from_world = min(poses, key=itemgetter(0, 1))
+            guesses[image] = (other, cam_from_world)
     return guesses
 
 
@@ -223,61 +211,57 @@ class DepthRecord:
 
 def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
     """Find the depth map of each image: same rig and timestamp, closest depth sensor."""
-    carried = _carried(data)
-    rigs_of = _rigs_of(carried)
-    at_time: dict[int, list[tuple[str, str]]] = {}
-    for (timestamp, sensor), path in sorted(data.records_depth.items()):
-        at_time.setdefault(timestamp, []).append((sensor, path))
+    siblings = _siblings_on_rig(data, data.records_depth)
     depth_of = {}
-    for (timestamp, camera), image in data.records_camera.items():
+    for record, image in data.records_camera.items():
         options = [
-            (image_from_depth, sensor, path)
-            for sensor, path in at_time.get(timestamp, ())
-            if (image_from_depth := _between(carried, rigs_of, camera, sensor)) is not None
+            (float(np.linalg.norm(image_from_depth.translation)), sensor, path, image_from_depth)
+            for sensor, path, image_from_depth in siblings(*record)
         ]
         if options:
-            image_from_depth, sensor, path = min(
-                options, key=lambda option: (np.linalg.norm(option[0].translation), option[1])
-            )
+            _, sensor, path, image_from_depth = min(options, key=itemgetter(0, 1))
             depth_of[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
     return depth_of
 
 
-_Carried = Mapping[str, Mapping[str, RigidTransform]]
+def _siblings_on_rig(
+    data: KaptureData, records: Mapping[tuple[int, str], str]
+) -> Callable[[int, str], Iterator[tuple[str, str, RigidTransform]]]:
+    """Return a function of timestamp and sensor that yields the records on the same rig.
+
+    It yields other sensor, path and ``sensor_from_other``.
+    """
+    mounts = _mounts(data)
+    at_time: dict[int, list[tuple[str, str]]] = {}
+    for (timestamp, sensor), path in records.items():
+        at_time.setdefault(timestamp, []).append((sensor, path))
+
+    def siblings(timestamp: int, sensor: str) -> Iterator[tuple[str, str, RigidTransform]]:
+        of_sensor = mounts.get(sensor, {})
+        for other, path in at_time.get(timestamp, ()):
+            of_other = mounts.get(other, {})
+            rig = next((rig for rig in of_sensor if rig in of_other), None)
+            if rig is not None:
+                yield other, path, of_sensor[rig] @ of_other[rig].inverse()
+
+    return siblings
 
 
-def _carried(data: KaptureData) -> _Carried:
-    """Return ``sensor_from_rig`` by sensor for each top-level rig, through nested rigs."""
+def _mounts(data: KaptureData) -> dict[str, dict[str, RigidTransform]]:
+    """Return ``sensor_from_rig`` by sensor and top-level rig, sorted, through nested rigs."""
+    mounts: dict[str, dict[str, RigidTransform]] = {}
 
-    def members(rig: str) -> dict[str, RigidTransform]:
-        sensors = {}
-        for member, member_from_rig in data.rigs[rig].items():
-            if member not in data.rigs:
-                sensors[member] = member_from_rig
-                continue
-            for sensor, sensor_from_member in members(member).items():
-                sensors[sensor] = sensor_from_member @ member_from_rig
-        return sensors
+    def mount(devices: Mapping[str, RigidTransform], rig: str) -> None:
+        for device, device_from_rig in devices.items():
+            if device in data.rigs:
+                mount({d: p @ device_from_rig for d, p in data.rigs[device].items()}, rig)
+            else:
+                mounts.setdefault(device, {})[rig] = device_from_rig
 
-    on_others = {member for parts in data.rigs.values() for member in parts}
-    return {rig: members(rig) for rig in sorted(data.rigs) if rig not in on_others}
-
-
-def _rigs_of(carried: _Carried) -> dict[str, list[str]]:
-    rigs_of: dict[str, list[str]] = {}
-    for rig, members in sorted(carried.items()):
-        for sensor in members:
-            rigs_of.setdefault(sensor, []).append(rig)
-    return rigs_of
-
-
-def _between(
-    carried: _Carried, rigs_of: Mapping[str, list[str]], sensor: str, other: str
-) -> RigidTransform | None:
-    for rig in rigs_of.get(sensor, ()):
-        if other in carried[rig]:
-            return carried[rig][sensor] @ carried[rig][other].inverse()
-    return None
+    on_others = {member for members in data.rigs.values() for member in members}
+    for rig in sorted(data.rigs.keys() - on_others):
+        mount(data.rigs[rig], rig)
+    return mounts
 
 
 _NO_POINTS = np.zeros(0, np.int64)
