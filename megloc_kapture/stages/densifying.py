@@ -54,7 +54,7 @@ from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import (
     check_points,
     depth_records,
-    index_map,
+    indices_of,
     with_noise,
     write_array,
 )
@@ -144,7 +144,7 @@ def densify_map(
     )
     data = source.read()
     fit = fitted_to_poses(source, options.max_size_px)
-    indices = [index_map(source, local_type) for local_type in source.observations()]
+    indices = indices_of(source)
     rows = _plan(source, indices, fit, tables)
     scratch = output / f".{FOLDER}"
     planned = [row for row in rows if not row.reason]
@@ -193,8 +193,7 @@ def fitted_to_poses(source: KaptureFolder, max_size_px: int) -> StereoFit:
     confirm finer detail. A reduced image is compared with proportionally more sources. Two views
     agree up to five times the pose error, or up to the default tolerance if that is larger.
     """
-    indices = [index_map(source, local_type) for local_type in source.observations()]
-    angles = [with_noise(source, index).noise_rad for index in indices]
+    angles = [with_noise(source, index).noise_rad for index in indices_of(source)]
     error_rad = min((angle for angle in angles if np.isfinite(angle)), default=0.0)
     data = source.read()
     cameras = [data.camera_of(image) for image in data.poses()]
@@ -288,9 +287,9 @@ def _estimate(
         if not is_out_of_memory(error):
             raise
         return "out of memory; make mvs.max_size_px smaller"
-    write_array(_scratch_file(scratch, row.image, "depth"), estimate.depth_m)
-    write_array(_scratch_file(scratch, row.image, "sigma"), estimate.sigma_m)
-    write_array(_scratch_file(scratch, row.image, "normals"), estimate.normals)
+    file = _scratch_file(scratch, row.image)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(file, **vars(estimate))
     return ""
 
 
@@ -308,13 +307,12 @@ def _confirm(
     row, seen_of_type = job
     image, size = row.image, fit.max_size_px
     view = _view(folder, image, size)
-    names = ("depth", "sigma", "normals")
-    estimate = DepthEstimate(*(np.load(_scratch_file(scratch, image, name)) for name in names))
+    estimate = DepthEstimate(**np.load(_scratch_file(scratch, image)))
     sources = [_view(folder, other, size) for other in row.sources]
     others = [
-        (source, np.load(path))
+        (source, np.load(path)["depth_m"])
         for other, source in zip(row.sources, sources, strict=True)
-        if (path := _scratch_file(scratch, other, "depth")).is_file()
+        if (path := _scratch_file(scratch, other)).is_file()
     ]
     kept = confirmed(view, estimate, others, fit.tolerance_px)
     limits = row.near_m, row.far_m
@@ -355,8 +353,8 @@ def _lift(
     return LiftedPoints(view.cam_from_world.inverse().apply(points[valid]), packed, ids[valid])
 
 
-def _scratch_file(scratch: Path, image: str, kind: str) -> Path:
-    return safe_join(scratch, f"{image}.{kind}.npy")
+def _scratch_file(scratch: Path, image: str) -> Path:
+    return safe_join(scratch, f"{image}.npz")
 
 
 class Densify(PipelineStage):

@@ -273,7 +273,7 @@ def _depth_records_of(folder: KaptureFolder) -> dict[str, DepthRecord]:
 
 
 @lru_cache(maxsize=4)
-def _indices_of(folder: KaptureFolder) -> list[MapIndex]:
+def indices_of(folder: KaptureFolder) -> list[MapIndex]:
     return [index_map(folder, local_type) for local_type in folder.observations()]
 
 
@@ -327,7 +327,7 @@ class KaptureScene:
         return depth_of(self._map, name)
 
     def map_points(self, name: str) -> NDArray[np.float64]:
-        seen = [index.observed(name)[1] for index in _indices_of(self._map)]
+        seen = [index.observed(name)[1] for index in indices_of(self._map)]
         return self._map.points3d()[:, :3][np.unique(np.concatenate([_NO_POINTS, *seen]))]
 
     def map_pose(self, name: str) -> RigidTransform:
