@@ -56,7 +56,8 @@ from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages.local_features import extract_all
 from megloc_kapture.stages.matches import match_all
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, MAP, Stage
+from megloc_kapture.stages.paths import EVALUATION, LOCALIZED, MAP
+from megloc_kapture.stages.stage import Stage
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import (
     Camera,

@@ -37,7 +37,7 @@ from megloc_kapture.pipeline.export import ExportFormat, export
 from megloc_kapture.pipeline.map_making import import_colmap
 from megloc_kapture.pipeline.presets import assigned, options_with
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
-from megloc_kapture.stages.stage import MAP
+from megloc_kapture.stages.paths import MAP
 from megloc_kapture.stages.work import Work
 
 DATASET, COLMAP, MEGADEPTH = "dataset", "colmap", "megadepth"

@@ -42,7 +42,7 @@ from megloc_kapture.pipeline.submission import (
     workspace_provenance,
     write_submission,
 )
-from megloc_kapture.stages.stage import EVALUATION
+from megloc_kapture.stages.paths import EVALUATION
 
 
 @dataclass(frozen=True, kw_only=True)

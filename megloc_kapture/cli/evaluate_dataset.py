@@ -26,7 +26,7 @@ from megloc_kapture.pipeline.evaluation_plan import (
 from megloc_kapture.pipeline.plan import Workspace, all_kept, run_plan
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.pipeline.submission import FOLDER, keep_submission
-from megloc_kapture.stages.stage import EVALUATION, LOCALIZED
+from megloc_kapture.stages.paths import EVALUATION, LOCALIZED
 
 BELOW_RECALL = 3
 

@@ -35,7 +35,7 @@ from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.matches import candidates_of
-from megloc_kapture.stages.stage import LOCALIZED
+from megloc_kapture.stages.paths import LOCALIZED
 
 _log = logging.getLogger(__name__)
 

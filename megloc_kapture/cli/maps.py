@@ -42,8 +42,9 @@ from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
 from megloc_kapture.stages.map_refinement import REPORT_FILE, refine_map
+from megloc_kapture.stages.paths import LOCALIZED, MAP
 from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.stage import LOCALIZED, MAP, counts_text
+from megloc_kapture.stages.stage import counts_text
 from megloc_kapture.stages.stereo_depth import fuse_depth
 
 

@@ -32,6 +32,7 @@ from megloc_kapture.pipeline.presets import assigned, check_weights, options_of_
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES, RenderedDataset
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.guided_pyramid import RematchQueries
 from megloc_kapture.stages.image_pairs import PairQueries
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
@@ -41,15 +42,8 @@ from megloc_kapture.stages.pose_refinement import RefinePoses
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.reranking import RerankQueries
 from megloc_kapture.stages.stage import (
-    EVALUATION,
-    LOCALIZED,
-    MAPPING,
     PROTOCOL,
-    QUERY,
-    QUERY_GT,
-    REFERENCE,
     ROOT,
-    SUBMISSIONS,
     PipelineStage,
     Stage,
     StageWork,
@@ -108,7 +102,7 @@ class Run:
             stem = protocol.pose_file_stem
         end = "" if protocol.pose_file == "mlad" else ".txt"
         method = "-".join(("megloc", self.preset, *self._changed_features().values()))
-        return folder / SUBMISSIONS / f"{stem}_eval_{method}{end}"
+        return folder / paths.SUBMISSIONS / f"{stem}_eval_{method}{end}"
 
     def provenance(self) -> dict[str, Any]:
         options = self.options.model_dump(mode="json")
@@ -272,7 +266,7 @@ class Import(_RunStage):
 
     name = "import"
     version = 4
-    writes = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES, REFERENCE)
+    writes = (paths.MAPPING, paths.QUERY, paths.QUERY_GT, SIDE_TABLES, paths.REFERENCE)
 
     def __init__(self, run: Run) -> None:
         super().__init__(run)
@@ -303,7 +297,7 @@ class Import(_RunStage):
         root = work.path(WORLD) if source.root is None else source.root.resolve()
         counts = source.import_to(root, work.out)
         require(counts["queries"], "no query image is left to localize", path=root)
-        unreadable = set_aside_unreadable(work.out / QUERY, work.out / SIDE_TABLES, work)
+        unreadable = set_aside_unreadable(work.out / paths.QUERY, work.out / SIDE_TABLES, work)
         protocol = read_side_tables(work.out / SIDE_TABLES).protocol
         if protocol.dataset == Protocol().dataset:
             protocol = protocol.model_copy(update={"dataset": self._run.dataset})
@@ -316,15 +310,15 @@ class Submit(_RunStage):
 
     name = "submission"
     version = 4
-    reads = (SIDE_TABLES, LOCALIZED)
-    writes = (SUBMISSIONS,)
+    reads = (SIDE_TABLES, paths.LOCALIZED)
+    writes = (paths.SUBMISSIONS,)
 
     def settings(self) -> dict[str, Any]:
         return {**self._run.provenance(), PROTOCOL: self._protocol()}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return write_submission(
-            work.path(LOCALIZED),
+            work.path(paths.LOCALIZED),
             self._run.submission_below(work.out, work.path(SIDE_TABLES)),
             tables=work.path(SIDE_TABLES),
             provenance=self._run.provenance(),
@@ -336,18 +330,18 @@ class Evaluate(_RunStage):
 
     name = "evaluation"
     version = 4
-    reads = (MAPPING, QUERY_GT, SIDE_TABLES, LOCALIZED)
-    writes = (EVALUATION,)
+    reads = (paths.MAPPING, paths.QUERY_GT, SIDE_TABLES, paths.LOCALIZED)
+    writes = (paths.EVALUATION,)
 
     def settings(self) -> dict[str, Any]:
         steps = explain(self.options)
         return {**self._run.provenance(), "steps": steps, PROTOCOL: self._protocol()}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        localized, truth, tables = map(work.path, (LOCALIZED, QUERY_GT, SIDE_TABLES))
+        localized, truth, tables = map(work.path, (paths.LOCALIZED, paths.QUERY_GT, SIDE_TABLES))
         provenance = self.settings() | {"versions": package_versions()}
         del provenance[PROTOCOL]  # the report shows the protocol as text
-        output, label = work.out / EVALUATION, self._run.label
+        output, label = work.out / paths.EVALUATION, self._run.label
         if not truth.is_dir():
             results = results_without_truth([localized], benchmark_of(tables), labels=[label])
             write_report(output, results, provenance=provenance)
@@ -365,7 +359,7 @@ class Evaluate(_RunStage):
 
 def recall_rows(workspace: Path) -> dict[str, Any]:
     """Return rows of the recall table by name; empty without true poses."""
-    path = workspace / EVALUATION / RECALL_JSON
+    path = workspace / paths.EVALUATION / RECALL_JSON
     if not path.is_file():
         return {}
     return {row["name"]: row for row in json.loads(path.read_text(encoding="utf-8"))["rows"]}

@@ -61,11 +61,9 @@ from megloc_kapture.stages.map_points import MakePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.paths import MAP, MAPPING, QUERY
 from megloc_kapture.stages.preprocessing import Preprocess
 from megloc_kapture.stages.stage import (
-    MAP,
-    MAPPING,
-    QUERY,
     ROOT,
     PipelineStage,
     Stage,

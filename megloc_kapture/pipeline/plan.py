@@ -29,9 +29,9 @@ from megloc_kapture.io.files import (
     writing,
 )
 from megloc_kapture.io.output_folders import claim_folder, release_folder
+from megloc_kapture.stages.paths import MAP
 from megloc_kapture.stages.stage import (
     CODE_OF,
-    MAP,
     PROTOCOL,
     ROOT,
     Stage,

@@ -23,7 +23,7 @@ from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs, Queries
 from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
-from megloc_kapture.stages.stage import LOCALIZED
+from megloc_kapture.stages.paths import LOCALIZED
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Failure, Pose, RigidTransform
 

@@ -49,6 +49,7 @@ from megloc_kapture.plugins import (
     PluginChoice,
     StereoView,
 )
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import (
@@ -58,7 +59,7 @@ from megloc_kapture.stages.scene import (
     with_noise,
     write_array,
 )
-from megloc_kapture.stages.stage import MAP, PipelineStage, StageWork
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
     FOLDER,
@@ -365,7 +366,7 @@ class Densify(PipelineStage):
     uses = ("mvs",)
     explained_by = ("mvs.mode",)
     inputs = (PipelineStage.sparse_map, SIDE_TABLES)
-    outputs = (MAP,)
+    outputs = (paths.MAP,)
 
     def is_wanted(self) -> bool:
         return self.options.mvs.mode != "off"
@@ -376,7 +377,7 @@ class Densify(PipelineStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         return densify_map(
             work.folder(self.sparse_map()),
-            work.out / MAP,
+            work.out / paths.MAP,
             self.options.mvs,
             tables=read_side_tables(work.path(SIDE_TABLES)),
             link_features=True,

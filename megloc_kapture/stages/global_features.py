@@ -25,8 +25,8 @@ from megloc_kapture.plugin_loading import (
     option_fault,
     plugin_names,
 )
-from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
-from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
+from megloc_kapture.plugins import GLOBAL_FEATURES, GlobalFeatureExtractor, PluginChoice
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import Job, images_of, read_stored_image, size_of
 from megloc_kapture.stages.map_features import (
     MEAN_FILE,
@@ -35,14 +35,7 @@ from megloc_kapture.stages.map_features import (
     VOCABULARY_FILE,
 )
 from megloc_kapture.stages.scene import write_array
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    GLOBAL_FEATURES,
-    LOCAL_FEATURES,
-    LOCAL_TYPES,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import (
     HERE,
     Batched,
@@ -175,12 +168,12 @@ class GlobalFeaturesChoice(PluginChoice):
             raise OptionError(f"global features {VLAD!r} reject their options: {fault}") from error
 
     def make(self, placement: NetworkOptions = AUTO) -> GlobalFeatureExtractor:
-        known = plugin_names(PLUGINS)
+        known = plugin_names(GLOBAL_FEATURES)
         if self.name not in known:
             raise OptionError(
                 f"unknown global features {self.name!r}; {suggestion(self.name, [VLAD, *known])}"
             )
-        extractor: GlobalFeatureExtractor = load_chosen(PLUGINS, self, placement)
+        extractor: GlobalFeatureExtractor = load_chosen(GLOBAL_FEATURES, self, placement)
         return extractor
 
     def type_name(self, main_local_type: str) -> str:
@@ -259,12 +252,12 @@ class ExtractGlobalFeatures(PipelineStage):
     resumes = True
     uses = ("global_features.name", "global_features.options", *LOCAL_TYPES)
     explained_by = ("global_features",)
-    outputs = (GLOBAL_FEATURES,)
+    outputs = (paths.GLOBAL_FEATURES,)
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
         images = (self.mapping(), self.query())
-        return (*images, LOCAL_FEATURES) if self._trains() else images
+        return (*images, paths.LOCAL_FEATURES) if self._trains() else images
 
     def _trains(self) -> bool:
         return any(chosen.is_vlad for chosen in self.options.global_features)
@@ -281,8 +274,8 @@ class ExtractGlobalFeatures(PipelineStage):
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.mapping(), FEATURES)
-        folders = [mapping, *work.folders((self.query(),), FEATURES)]
+        mapping = work.folder(self.mapping(), paths.FEATURES)
+        folders = [mapping, *work.folders((self.query(),), paths.FEATURES)]
         counts: dict[str, float] = {}
         for chosen in self.options.global_features:
             if chosen.is_vlad:

@@ -52,6 +52,7 @@ from megloc_kapture.matching.verification import (
     two_view_of_variants,
 )
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import check_lengths, extract_all, read_frame
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
@@ -64,18 +65,7 @@ from megloc_kapture.stages.matches import (
     one_way,
     pairs_to_rematch,
 )
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    LOCAL_FEATURES,
-    MAPPING_MATCHES,
-    MAPPING_PAIRS,
-    MAPPING_PYRAMID,
-    QUERY_MATCHES,
-    QUERY_PAIRS,
-    QUERY_PYRAMID,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import BATCH, HERE, Work, batched
 
 _log = logging.getLogger(__name__)
@@ -524,7 +514,7 @@ class RematchMapping(_Rematching):
     """Match pairs of map images again: by a second matcher, and at other scales and rotations."""
 
     name = "mapping_rematching"
-    matches, of_queries = MAPPING_MATCHES, False
+    matches, of_queries = paths.MAPPING_MATCHES, False
     uses = (
         *MATCHING_OPTIONS,
         "mapping_verification",
@@ -532,14 +522,19 @@ class RematchMapping(_Rematching):
         "guided_pyramid",
         "mask_margin_px",
     )
-    inputs = (PipelineStage.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
-    outputs = (MAPPING_PYRAMID,)
+    inputs = (
+        PipelineStage.mapping,
+        paths.LOCAL_FEATURES,
+        paths.MAPPING_PAIRS,
+        paths.MAPPING_MATCHES,
+    )
+    outputs = (paths.MAPPING_PYRAMID,)
 
     def is_wanted(self) -> bool:
         return self.options.rematches_map()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.mapping(), FEATURES, MAPPING_MATCHES)
+        mapping = work.folder(self.mapping(), paths.FEATURES, paths.MAPPING_MATCHES)
         pairs = mapping_pairs(work, mapping)
         return self._match_again(work, mapping, mapping, pairs, self.options.verify_mapping())
 
@@ -549,7 +544,7 @@ class RematchQueries(_Rematching):
 
     name = "query_rematching"
     explained_by = ("second_matching.queries", *_Rematching.explained_by)
-    matches, of_queries = QUERY_MATCHES, True
+    matches, of_queries = paths.QUERY_MATCHES, True
     uses = (
         *MATCHING_OPTIONS,
         "map",
@@ -561,18 +556,18 @@ class RematchQueries(_Rematching):
     inputs = (
         PipelineStage.mapping,
         PipelineStage.query,
-        LOCAL_FEATURES,
+        paths.LOCAL_FEATURES,
         PipelineStage.mapping_matches,
-        QUERY_PAIRS,
-        QUERY_MATCHES,
+        paths.QUERY_PAIRS,
+        paths.QUERY_MATCHES,
     )
-    outputs = (QUERY_PYRAMID,)
+    outputs = (paths.QUERY_PYRAMID,)
 
     def is_wanted(self) -> bool:
         return self.options.rematches_queries()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.query(), FEATURES, QUERY_MATCHES)
-        mapping = work.folder(self.mapping(), FEATURES, *self.mapping_matches())
-        pairs = read_pairs(work.path(QUERY_PAIRS))
+        query = work.folder(self.query(), paths.FEATURES, paths.QUERY_MATCHES)
+        mapping = work.folder(self.mapping(), paths.FEATURES, *self.mapping_matches())
+        pairs = read_pairs(work.path(paths.QUERY_PAIRS))
         return self._match_again(work, query, mapping, pairs, self.options.verify_queries())

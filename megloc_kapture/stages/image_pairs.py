@@ -39,17 +39,9 @@ from megloc_kapture.retrieval.search import (
     common_length,
     rank_rows,
 )
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.scene import check_points
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    GLOBAL_FEATURES,
-    LOCAL_TYPES,
-    MAPPING_PAIRS,
-    QUERY_PAIRS,
-    REFERENCE,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.values import Options
 
 _QUERY_ELEMENTS = 1 << 27  # elements of query vectors in memory at once: 512 MiB of float32
@@ -272,21 +264,26 @@ class PairMapping(PipelineStage):
     version = 4
     uses = ("mapping_pairs", *RETRIEVAL_OPTIONS)
     explained_by = ("map", "mapping_pairs.by")
-    inputs = (PipelineStage.mapping, SIDE_TABLES, GLOBAL_FEATURES, PipelineStage.pairing_points)
-    outputs = (MAPPING_PAIRS,)
+    inputs = (
+        PipelineStage.mapping,
+        SIDE_TABLES,
+        paths.GLOBAL_FEATURES,
+        PipelineStage.pairing_points,
+    )
+    outputs = (paths.MAPPING_PAIRS,)
 
     def is_wanted(self) -> bool:
         return self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_map_images(
-            work.folder(self.mapping(), FEATURES),
+            work.folder(self.mapping(), paths.FEATURES),
             self.options.mapping_pairs,
             retrieval=self.options.retrieval(),
             tables=read_side_tables(work.path(SIDE_TABLES)),
-            covisible=work.folder(REFERENCE) if self.options.pairs_by_points() else None,
+            covisible=work.folder(paths.REFERENCE) if self.options.pairs_by_points() else None,
         )
-        write_pairs(work.out / MAPPING_PAIRS, pairs)
+        write_pairs(work.out / paths.MAPPING_PAIRS, pairs)
         return {"pairs": len(pairs)}
 
 
@@ -296,17 +293,17 @@ class PairQueries(PipelineStage):
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
     explained_by = ("query_pairs.by", "query_pairs.top_k")
-    inputs = (PipelineStage.mapping, PipelineStage.query, SIDE_TABLES, GLOBAL_FEATURES)
+    inputs = (PipelineStage.mapping, PipelineStage.query, SIDE_TABLES, paths.GLOBAL_FEATURES)
     outputs = (PipelineStage.candidates,)
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        return "query_pairs" if self.candidates() == QUERY_PAIRS else "query_candidates"
+        return "query_pairs" if self.candidates() == paths.QUERY_PAIRS else "query_candidates"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_queries(
-            work.folder(self.mapping(), FEATURES),
-            work.folder(self.query(), FEATURES),
+            work.folder(self.mapping(), paths.FEATURES),
+            work.folder(self.query(), paths.FEATURES),
             self.options.query_pairs,
             retrieval=self.options.retrieval(),
             tables=read_side_tables(work.path(SIDE_TABLES)),

@@ -27,12 +27,8 @@ from megloc_kapture.io.kapture.features import feature_folder, has_features
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
-from megloc_kapture.stages.stage import (
-    LOCAL_FEATURES,
-    LOCAL_TYPES,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages import paths
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Batched, Work, in_batches, resumed_label
 from megloc_kapture.values import Camera, LocalFeatures
 
@@ -243,7 +239,7 @@ class ExtractLocalFeatures(PipelineStage):
     uses = ("mask_margin_px", *LOCAL_TYPES)
     explained_by = ("local_features",)
     inputs = (PipelineStage.mapping, PipelineStage.query)
-    outputs = (LOCAL_FEATURES,)
+    outputs = (paths.LOCAL_FEATURES,)
 
     def plugins(self) -> Sequence[object]:
         return self.options.make_extractors()

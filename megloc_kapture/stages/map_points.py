@@ -23,18 +23,11 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.features import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import warn_of_other_size
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import depth_of, depth_records
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    GLOBAL_FEATURES,
-    LOCAL_FEATURES,
-    LOCAL_TYPES,
-    UNREFINED,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 
 
@@ -219,12 +212,17 @@ class MakePoints(PipelineStage):
     version = 4
     uses = ("map", "triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
     explained_by = ("map",)
-    inputs = (PipelineStage.mapping, LOCAL_FEATURES, GLOBAL_FEATURES, PipelineStage.mapping_matches)
-    outputs = (UNREFINED,)
+    inputs = (
+        PipelineStage.mapping,
+        paths.LOCAL_FEATURES,
+        paths.GLOBAL_FEATURES,
+        PipelineStage.mapping_matches,
+    )
+    outputs = (paths.UNREFINED,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        options, out = self.options, work.out / UNREFINED
-        mapping = work.folder(self.mapping(), FEATURES, *self.mapping_matches())
+        options, out = self.options, work.out / paths.UNREFINED
+        mapping = work.folder(self.mapping(), paths.FEATURES, *self.mapping_matches())
         if not options.triangulates():
             return lift_map(mapping, options.local_types(), out, work=work)
         types, threads = options.matched_types(), work.num_threads

@@ -50,9 +50,10 @@ from megloc_kapture.mapping.uncertainty import (
     too_uncertain,
 )
 from megloc_kapture.plugins import DepthView
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import check_points, depth_of, depth_records
-from megloc_kapture.stages.stage import UNREFINED, PipelineStage, StageWork
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
 
@@ -387,11 +388,11 @@ class RefineMap(PipelineStage):
     version = 3
     uses = ("refinement",)
     explained_by = ("refinement.depth.max_sigmas", "refinement.uncertainty.max_robust_sigmas")
-    inputs = (UNREFINED, SIDE_TABLES)
+    inputs = (paths.UNREFINED, SIDE_TABLES)
     outputs = (PipelineStage.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        folder, out = work.folder(UNREFINED), work.out / self.sparse_map()
+        folder, out = work.folder(paths.UNREFINED), work.out / self.sparse_map()
         counts = refine_map(
             folder,
             out,

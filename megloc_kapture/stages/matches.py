@@ -44,16 +44,9 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import Matcher, PluginChoice
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import check_lengths
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    LOCAL_FEATURES,
-    MAPPING_MATCHES,
-    MAPPING_PAIRS,
-    QUERY_MATCHES,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import (
     HERE,
     Batched,
@@ -419,7 +412,7 @@ EXPLAINED = ("map", *MATCHING_OPTIONS)
 def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
     """Read the pairs of map images, without those of unregistered photographs."""
     names = set(mapping.read().image_names())
-    return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
+    return [p for p in read_pairs(work.path(paths.MAPPING_PAIRS)) if {p.query, p.map} <= names]
 
 
 class MatchMapping(PipelineStage):
@@ -430,8 +423,8 @@ class MatchMapping(PipelineStage):
     resumes = True
     explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "mapping_verification")
-    inputs = (PipelineStage.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
-    outputs = (MAPPING_MATCHES,)
+    inputs = (PipelineStage.mapping, paths.LOCAL_FEATURES, paths.MAPPING_PAIRS)
+    outputs = (paths.MAPPING_MATCHES,)
 
     def is_wanted(self) -> bool:
         return self.options.triangulates()
@@ -443,7 +436,7 @@ class MatchMapping(PipelineStage):
         return self.options.verify_mapping()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.mapping(), FEATURES)
+        mapping = work.folder(self.mapping(), paths.FEATURES)
         pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
         # the poses of photographs are not given, but estimated from the same matches
         if isinstance(self.verification(), KnownPoseOptions) and not self.posed:
@@ -464,16 +457,21 @@ class MatchQueries(PipelineStage):
     resumes = True
     explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "query_verification")
-    inputs = (PipelineStage.mapping, PipelineStage.query, LOCAL_FEATURES, PipelineStage.candidates)
-    outputs = (QUERY_MATCHES,)
+    inputs = (
+        PipelineStage.mapping,
+        PipelineStage.query,
+        paths.LOCAL_FEATURES,
+        PipelineStage.candidates,
+    )
+    outputs = (paths.QUERY_MATCHES,)
 
     def plugins(self) -> Sequence[object]:
         return [self.options.make_matcher(name) for name in self.options.local_types()]
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.query(), FEATURES)
-        mapping = work.folder(self.mapping(), FEATURES)
-        pairs, out = read_pairs(work.path(self.candidates())), work.out / QUERY_MATCHES
+        query = work.folder(self.query(), paths.FEATURES)
+        mapping = work.folder(self.mapping(), paths.FEATURES)
+        pairs, out = read_pairs(work.path(self.candidates())), work.out / paths.QUERY_MATCHES
         counts: Counter[str] = Counter()
         for name in self.options.local_types():
             matcher, how = self.options.make_matcher(name), self.options.verify_queries()

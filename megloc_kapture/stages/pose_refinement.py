@@ -51,16 +51,10 @@ from megloc_kapture.refinement.references import (
     contradicts,
     spread_names,
 )
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.localized_folder import write_result_tables, write_timing
 from megloc_kapture.stages.scene import KaptureScene
-from megloc_kapture.stages.stage import (
-    LOCALIZED,
-    MAP,
-    REFINEMENT_TIMING,
-    UNREFINED_POSES,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work, ordered_map
 from megloc_kapture.values import Camera, LocalizationResult, Options, Pose, RigidTransform
 
@@ -351,8 +345,8 @@ class RefinePoses(PipelineStage):
     version = 4
     uses = ("pose_refinement",)
     explained_by = ("pose_refinement.by",)
-    inputs = (SIDE_TABLES, PipelineStage.query, MAP, UNREFINED_POSES)
-    outputs = (LOCALIZED, REFINEMENT_TIMING)
+    inputs = (SIDE_TABLES, PipelineStage.query, paths.MAP, paths.UNREFINED_POSES)
+    outputs = (paths.LOCALIZED, paths.REFINEMENT_TIMING)
 
     def explain(self) -> str:
         return f"{super().explain()}, references = map images of the query's cluster"
@@ -365,12 +359,12 @@ class RefinePoses(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return refine_poses(
-            work.folder(MAP),
+            work.folder(paths.MAP),
             work.folder(self.query()),
-            work.folder(UNREFINED_POSES),
-            work.out / LOCALIZED,
+            work.folder(paths.UNREFINED_POSES),
+            work.out / paths.LOCALIZED,
             self.options.pose_refinement,
             tables=read_side_tables(work.path(SIDE_TABLES)),
             work=work,
-            timing=work.out / REFINEMENT_TIMING,
+            timing=work.out / paths.REFINEMENT_TIMING,
         )

@@ -39,15 +39,9 @@ from megloc_kapture.preprocessing.masks import (
     edge_directions,
     find_unchanging_region,
 )
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import check_size, mask_path, read_image_of, read_mask
-from megloc_kapture.stages.stage import (
-    MAPPING,
-    PREPROCESSED,
-    QUERY,
-    PipelineStage,
-    StageWork,
-    files_fingerprint,
-)
+from megloc_kapture.stages.stage import PipelineStage, StageWork, files_fingerprint
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options
 
@@ -97,10 +91,10 @@ def mask_files(
         raise DataError("no such folder of masks", path=user_masks)
     files_of = {}
     for image in images:
-        paths = {"own": mask_path(folder, image)}
+        places = {"own": mask_path(folder, image)}
         if user_masks is not None:
-            paths["user"] = user_masks / f"{image}.png"
-        files_of[image] = {source: path for source, path in paths.items() if path.is_file()}
+            places["user"] = user_masks / f"{image}.png"
+        files_of[image] = {source: path for source, path in places.items() if path.is_file()}
     if user_masks is not None and not any("user" in files for files in files_of.values()):
         example = next(iter(files_of), "a/b.jpg")
         raise DataError(
@@ -452,8 +446,8 @@ class Preprocess(PipelineStage):
         "preprocessing.undistort",
         "preprocessing.masks.segmenter",
     )
-    inputs = (MAPPING, QUERY)
-    outputs = (PREPROCESSED,)
+    inputs = (paths.MAPPING, paths.QUERY)
+    outputs = (paths.PREPROCESSED,)
 
     def is_wanted(self) -> bool:
         return self.options.preprocesses()
@@ -474,10 +468,10 @@ class Preprocess(PipelineStage):
         return fingerprints
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping, *queries = work.folders((MAPPING, QUERY))
+        mapping, *queries = work.folders((paths.MAPPING, paths.QUERY))
         options, counts = self.options.preprocessing, dict[str, float]()
         for folder in (mapping, *queries):
-            name, out = folder.root.name, work.out / PREPROCESSED / folder.root.name
+            name, out = folder.root.name, work.out / paths.PREPROCESSED / folder.root.name
             # static regions of queries also use the map's images, as a camera may have few queries
             # or only night queries
             others = [] if folder is mapping else [mapping]

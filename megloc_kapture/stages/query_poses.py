@@ -39,6 +39,7 @@ from megloc_kapture.localization.map_index import PoseProblem, QueryView, TypedM
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import AUTO, NetworkOptions, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.matches import candidates_of
 from megloc_kapture.stages.scene import (
@@ -50,18 +51,7 @@ from megloc_kapture.stages.scene import (
     shared_index,
     with_noise,
 )
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    LOCAL_FEATURES,
-    LOCAL_TYPES,
-    MAP,
-    MAPPING,
-    QUERY,
-    QUERY_PAIRS,
-    TIMING,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import MIN_CONFIDENCE, Failure, Fallback, Options, Pose, RigidTransform
 
@@ -330,26 +320,26 @@ class LocalizeQueries(PipelineStage):
         "localization.min_confidence",
     )
     inputs = (
-        MAPPING,
-        QUERY,
+        paths.MAPPING,
+        paths.QUERY,
         PipelineStage.query,
         SIDE_TABLES,
-        LOCAL_FEATURES,
-        MAP,
-        QUERY_PAIRS,
+        paths.LOCAL_FEATURES,
+        paths.MAP,
+        paths.QUERY_PAIRS,
         PipelineStage.query_matches,
     )
-    outputs = (PipelineStage.poses, TIMING)
+    outputs = (PipelineStage.poses, paths.TIMING)
 
     def plugins(self) -> Sequence[object]:
         return (self.options.localization.make_ranker(),)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        query = work.folder(self.query(), FEATURES, *self.query_matches())
-        pairs = read_pairs(work.path(QUERY_PAIRS))
+        query = work.folder(self.query(), paths.FEATURES, *self.query_matches())
+        pairs = read_pairs(work.path(paths.QUERY_PAIRS))
         options, tables = self.options.localization, work.path(SIDE_TABLES)
         results = localize_from_matches(
-            work.folder(MAP),
+            work.folder(paths.MAP),
             query,
             pairs,
             self.options.matched_types(),
@@ -360,11 +350,11 @@ class LocalizeQueries(PipelineStage):
         )
         return write_localized(
             work.out / self.poses(),
-            work.folder(QUERY),
+            work.folder(paths.QUERY),
             chain(results, starmap(unreadable_image, read_unreadable(tables).items())),
             fallback=options.fallback,
-            first_candidates=first_candidates(pairs, work.folder(MAPPING)),
-            timing=work.out / TIMING,
+            first_candidates=first_candidates(pairs, work.folder(paths.MAPPING)),
+            timing=work.out / paths.TIMING,
         )
 
 

@@ -18,17 +18,9 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, writ
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.retrieval.search import greedy_coverage
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.matches import VerifiedMatches, candidates_of
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    LOCAL_FEATURES,
-    LOCAL_TYPES,
-    QUERY_CANDIDATES,
-    QUERY_MATCHES,
-    QUERY_PAIRS,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.values import Options
 
 Matched = int | NDArray[np.int64]
@@ -155,20 +147,25 @@ class RerankQueries(PipelineStage):
     version = 4
     uses = ("reranking", *LOCAL_TYPES)
     explained_by = ("reranking.by", "reranking.keep", "reranking.local_type")
-    inputs = (PipelineStage.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
-    outputs = (QUERY_PAIRS,)
+    inputs = (
+        PipelineStage.query,
+        paths.LOCAL_FEATURES,
+        paths.QUERY_CANDIDATES,
+        paths.QUERY_MATCHES,
+    )
+    outputs = (paths.QUERY_PAIRS,)
 
     def is_wanted(self) -> bool:
         return self.options.reranking.reranks()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = reranked(
-            read_pairs(work.path(QUERY_CANDIDATES)),
-            work.folder(self.query(), FEATURES, QUERY_MATCHES),
-            work.path(QUERY_MATCHES),
+            read_pairs(work.path(paths.QUERY_CANDIDATES)),
+            work.folder(self.query(), paths.FEATURES, paths.QUERY_MATCHES),
+            work.path(paths.QUERY_MATCHES),
             self.options.local_types(),
             self.options.reranking,
         )
-        write_pairs(work.out / QUERY_PAIRS, pairs)
+        write_pairs(work.out / paths.QUERY_PAIRS, pairs)
         matched = sum(pair.score >= 1 for pair in pairs)
         return {"pairs": len(pairs), "with_correspondences": matched}

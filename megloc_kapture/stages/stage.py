@@ -27,6 +27,7 @@ from megloc_kapture.plugin_loading import (
     is_ours,
     weights_of,
 )
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options
 
@@ -60,22 +61,6 @@ def counts_text(counts: Mapping[str, float]) -> str:
         is_number = isinstance(value, int) and figure[-1].isdigit()
         texts.append(f"{figure} {words}" if is_number else f"{words}: {figure}")
     return ", ".join(texts)
-
-
-# paths in the workspace; the first four are imported kapture folders
-MAPPING, QUERY, QUERY_GT, REFERENCE = "mapping", "query", "query_gt", "reference"
-PREPROCESSED = "preprocessed"
-POSED, PHOTOGRAPH_MATCHES = "posed", "matches/photographs"  # for photographs without poses
-LOCAL_FEATURES, GLOBAL_FEATURES = "local_features", "global_features"
-MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
-QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before reranking
-MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
-MAPPING_PYRAMID, QUERY_PYRAMID = "pyramid/mapping", "pyramid/query"
-UNREFINED, SPARSE, MAP = "map_unrefined", "map_sparse", "map"
-UNREFINED_POSES, REFINEMENT_TIMING = "localized_unrefined", "timing_refinement.csv"
-LOCALIZED, SUBMISSIONS, EVALUATION = "localized", "submissions", "evaluation"
-TIMING = "timing.csv"
-FEATURES = ""  # the workspace itself holds local and global features
 
 
 def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
@@ -240,35 +225,39 @@ class PipelineStage(Stage):
     def mapping(self) -> str:
         """Return the folder of the map images: with estimated poses, pre-processed, or imported."""
         if self.posed:
-            return POSED
-        return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
+            return paths.POSED
+        return (
+            f"{paths.PREPROCESSED}/{paths.MAPPING}"
+            if self.options.preprocesses()
+            else paths.MAPPING
+        )
 
     def query(self) -> str:
-        return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
+        return f"{paths.PREPROCESSED}/{paths.QUERY}" if self.options.preprocesses() else paths.QUERY
 
     def pairing_points(self) -> tuple[str, ...]:
         """Return the dataset's prebuilt model, if its points are used to pair map images."""
-        return (REFERENCE,) if self.options.pairs_by_points() else ()
+        return (paths.REFERENCE,) if self.options.pairs_by_points() else ()
 
     def mapping_matches(self) -> tuple[str, ...]:
         if not self.options.triangulates():
             return ()
         # a pair is read from the first folder that contains it
         again = self.options.rematches_map()
-        return (MAPPING_PYRAMID, MAPPING_MATCHES) if again else (MAPPING_MATCHES,)
+        return (paths.MAPPING_PYRAMID, paths.MAPPING_MATCHES) if again else (paths.MAPPING_MATCHES,)
 
     def query_matches(self) -> tuple[str, ...]:
         again = self.options.rematches_queries()
-        return (QUERY_PYRAMID, QUERY_MATCHES) if again else (QUERY_MATCHES,)
+        return (paths.QUERY_PYRAMID, paths.QUERY_MATCHES) if again else (paths.QUERY_MATCHES,)
 
     def sparse_map(self) -> str:
-        return MAP if self.options.mvs.mode == "off" else SPARSE
+        return paths.MAP if self.options.mvs.mode == "off" else paths.SPARSE
 
     def candidates(self) -> str:
-        return QUERY_CANDIDATES if self.options.reranking.reranks() else QUERY_PAIRS
+        return paths.QUERY_CANDIDATES if self.options.reranking.reranks() else paths.QUERY_PAIRS
 
     def poses(self) -> str:
-        return UNREFINED_POSES if self.options.pose_refinement.refines() else LOCALIZED
+        return paths.UNREFINED_POSES if self.options.pose_refinement.refines() else paths.LOCALIZED
 
 
 WorkspacePath = str | Callable[[PipelineStage], str | tuple[str, ...]]
@@ -290,12 +279,10 @@ def _option_text(options: Any, key: str) -> str:
     return " + ".join(str(getattr(item, "name", item)) for item in several) or "none"
 
 
-def _selected(dump: Any, paths: Sequence[Sequence[str]]) -> Any:
-    if not all(paths):
+def _selected(dump: Any, keys: Sequence[Sequence[str]]) -> Any:
+    if not all(keys):
         return dump
     if isinstance(dump, list):
-        return [_selected(item, paths) for item in dump]
-    keys = dict.fromkeys(path[0] for path in paths)
-    return {
-        key: _selected(dump[key], [path[1:] for path in paths if path[0] == key]) for key in keys
-    }
+        return [_selected(item, keys) for item in dump]
+    names = dict.fromkeys(key[0] for key in keys)
+    return {name: _selected(dump[name], [k[1:] for k in keys if k[0] == name]) for name in names}

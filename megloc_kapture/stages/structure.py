@@ -29,18 +29,11 @@ from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.verification import agree_by_chance
+from megloc_kapture.stages import paths
 from megloc_kapture.stages.map_points import matched_pairs, matches_of
 from megloc_kapture.stages.matches import MATCHING_OPTIONS, MatchMapping, Verification
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    LOCAL_FEATURES,
-    LOCAL_TYPES,
-    PHOTOGRAPH_MATCHES,
-    POSED,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.values import Options, RigidTransform
 
 _UNTURNED = RigidTransform.identity()
@@ -69,7 +62,7 @@ class MatchPhotographs(MatchMapping):
 
     name = "photograph_matches"
     uses = (*MATCHING_OPTIONS, "query_verification")
-    outputs = (PHOTOGRAPH_MATCHES,)
+    outputs = (paths.PHOTOGRAPH_MATCHES,)
 
     def verification(self) -> Verification:
         return self.options.verify_photographs()
@@ -81,8 +74,8 @@ class FindPoses(PipelineStage):
     name = "poses"
     version = 3
     uses = (*LOCAL_TYPES, "query_verification")
-    inputs = (PipelineStage.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
-    outputs = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
+    inputs = (PipelineStage.mapping, SIDE_TABLES, paths.LOCAL_FEATURES, paths.PHOTOGRAPH_MATCHES)
+    outputs = (paths.POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
 
     def __init__(self, options: PipelineOptions, structure: StructureOptions) -> None:
         super().__init__(options)
@@ -92,7 +85,7 @@ class FindPoses(PipelineStage):
         return {**super().settings(), "structure": self._structure.model_dump(mode="json")}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping = work.folder(self.mapping(), FEATURES, PHOTOGRAPH_MATCHES)
+        mapping = work.folder(self.mapping(), paths.FEATURES, paths.PHOTOGRAPH_MATCHES)
         data, structure = mapping.read(), self._structure
         models = self._models(work, mapping, data)
         world, model, counts = _scaled(models[0], structure)
@@ -116,8 +109,8 @@ class FindPoses(PipelineStage):
             }
         write_unreadable(tables, reasons, UNREGISTERED_FILE)
         write_world(tables, world)
-        write_posed(work.out / POSED, data, model)
-        link_images(mapping.root, work.out / POSED)
+        write_posed(work.out / paths.POSED, data, model)
+        link_images(mapping.root, work.out / paths.POSED)
         return {
             "photographs": len(data.image_names()) + len(read_unreadable(work.path(SIDE_TABLES))),
             "with_a_pose": len(model.poses),
@@ -136,7 +129,7 @@ class FindPoses(PipelineStage):
             sensor, px = data.record_of(image)[1], keypoints.read(image)[:, :2]
             is_doubtful = data.sensors[sensor].name == ""
             photographs.append(Photograph(image, sensor, data.camera_of(image), px, is_doubtful))
-        counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
+        counts = read_match_counts(work.path(paths.PHOTOGRAPH_MATCHES), local_type)
         putative = {pair: count.matches for pair, count in counts.items()}
         reader = mapping.matches(local_type)
         matches = matches_of(reader, images, matched_pairs(reader, images, putative.keys()))

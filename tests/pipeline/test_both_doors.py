@@ -27,8 +27,8 @@ from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.matches import SecondMatchingOptions, candidates_of, pairs_to_rematch
+from megloc_kapture.stages.paths import MAPPING_MATCHES, QUERY_MATCHES
 from megloc_kapture.stages.query_poses import LocalizeQueries
-from megloc_kapture.stages.stage import MAPPING_MATCHES, QUERY_MATCHES
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated
 
