@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
-_BLOCK_ELEMENTS = 1 << 20  # distances held at once, about 80 bytes each
 # largest number of neighbours that are searched for similar viewing directions
 _MAX_SEARCHED = 1024
 _IMAGES_AT_ONCE = 256
@@ -49,44 +48,34 @@ class PairsByPosesOptions(Options):
 
 
 def pairs_by_poses(
-    cams_from_world: list[RigidTransform], options: PairsByPosesOptions | None = None
+    cams_from_world: list[RigidTransform], options: PairsByPosesOptions
 ) -> NDArray[np.int64]:
     """Return pairs (P, 2) of nearby images with similar viewing directions, i < j, sorted.
 
     The search extends to more and more neighbours in a k-d tree, at most the 1024 nearest centres
     (or ``num_neighbours``, if larger).
     """
-    options = options or PairsByPosesOptions()
-    count = len(cams_from_world)
+    count, wanted = len(cams_from_world), options.num_neighbours
     if count < 2:
         return np.zeros((0, 2), dtype=np.int64)
     centers = np.array([pose.center() for pose in cams_from_world])
     axes = np.array([pose.rotation_matrix()[2] for pose in cams_from_world])
-    min_cosine = np.cos(np.radians(options.max_angle_deg))
+    min_cosine = np.cos(np.radians(options.max_angle_deg)) - 1e-12
     tree = cKDTree(centers)
-    parts = [np.zeros((0, 2), dtype=np.int64)]
-    waiting = np.arange(count)
     # plus one, as an image is its own nearest neighbour
-    largest = min(count, max(_MAX_SEARCHED, options.num_neighbours) + 1)
-    size = min(largest, 4 * options.num_neighbours + 1)
-    while len(waiting):
-        unfinished = []
-        block = max(1, _BLOCK_ELEMENTS // size)
-        for start in range(0, len(waiting), block):
-            part = waiting[start : start + block]
-            _, index = tree.query(centers[part], k=size)
-            valid = index != part[:, None]
-            cosine = np.einsum("nd,nkd->nk", axes[part], axes[index])
-            good = valid & (cosine >= min_cosine - 1e-12)
-            rank = np.cumsum(good, axis=1)
-            # if neighbours have other viewing directions, search more of them
-            done = (rank[:, -1] >= options.num_neighbours) | (size >= largest)
-            take = good & (rank <= options.num_neighbours) & done[:, None]
-            rows, columns = np.nonzero(take)
-            parts.append(np.stack([part[rows], index[rows, columns]], axis=1))
-            unfinished.append(part[~done])
-        waiting = np.concatenate(unfinished)
-        size = min(largest, 2 * size)
+    largest = min(count, max(_MAX_SEARCHED, wanted) + 1)
+    sizes = [min(largest, 4 * wanted + 1)]
+    while sizes[-1] < largest:
+        sizes.append(min(largest, 2 * sizes[-1]))
+    parts = []
+    for image in range(count):
+        for size in sizes:  # if neighbours have other viewing directions, search more of them
+            near = tree.query(centers[image], k=size)[1]
+            similar = axes[near] @ axes[image] >= min_cosine
+            chosen = near[similar & (near != image)][:wanted]
+            if len(chosen) == wanted:
+                break
+        parts.append(np.stack([np.full(len(chosen), image), chosen], axis=1))
     return unique_pairs(np.concatenate(parts))
 
 
@@ -102,13 +91,12 @@ def pairs_by_covisibility(
     num_images: int,
     point_ids: NDArray[np.integer[Any]],
     image_ids: NDArray[np.integer[Any]],
-    options: PairsByCovisibilityOptions | None = None,
+    options: PairsByCovisibilityOptions,
 ) -> NDArray[np.int64]:
     """Pair each image with those that share the most points; int64 (P, 2), i < j, sorted.
 
     Observations (O,) are in any order.
     """
-    options = options or PairsByCovisibilityOptions()
     parts = [np.zeros((0, 2), dtype=np.int64)]
     ones, num_points = np.ones(len(point_ids), np.int32), int(point_ids.max(initial=-1)) + 1
     images_by_points = csr_array((ones, (image_ids, point_ids)), (num_images, num_points))

@@ -80,16 +80,13 @@ def by_all_distances(
     st.integers(0, 2**32 - 1),
     st.integers(1, 8),
     st.sampled_from([15.0, 60.0, 180.0]),
-    st.integers(1, 100),
 )
 def test_pairs_by_poses_equal_a_loop_over_all_pairs(
-    count: int, seed: int, num_neighbours: int, max_angle_deg: float, block: int
+    count: int, seed: int, num_neighbours: int, max_angle_deg: float
 ) -> None:
     cameras = random_cameras(count, seed)
     options = PairsByPosesOptions(num_neighbours=num_neighbours, max_angle_deg=max_angle_deg)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_BLOCK_ELEMENTS", block)
-        result = pairs_by_poses(cameras, options)
+    result = pairs_by_poses(cameras, options)
     assert result.dtype == np.int64 and result.shape[1] == 2
     assert result.tolist() == by_all_distances(cameras, options)
 
