@@ -104,30 +104,23 @@ def mask_files(
     return files_of
 
 
-def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, Mask]:
-    """Read the masks of an image by source, bool (H, W), True = use."""
-    masks = {source: read_mask(path, shape) for source, path in files.items()}
-    return {source: mask for source, mask in masks.items() if mask is not None}
-
-
 def _standing_masks(
-    fixed: Sequence[FixedMask], region: UnchangingRegion | None, width: int, height: int
+    fixed: Sequence[FixedMask], region: UnchangingRegion | None, camera: Camera
 ) -> dict[str, Mask]:
     """Return the masks of a camera by source, bool (H, W), in original pixels."""
-    masks = {}
-    if fixed:
-        masks["fixed"] = np.logical_and.reduce([_drawn(each, width, height) for each in fixed])
+    masks, size = {}, (camera.width, camera.height)
+    drawn = [each.drawn(*size) if each.file is None else _mask(each.file, camera) for each in fixed]
+    if drawn:
+        masks["fixed"] = np.logical_and.reduce(drawn)
     if region:
-        masks["unchanging"] = region.mask(width, height)
+        masks["unchanging"] = region.mask(*size)
     return masks
 
 
-def _drawn(fixed: FixedMask, width: int, height: int) -> Mask:
-    if fixed.file is None:
-        return fixed.drawn(width, height)
-    mask = read_mask(fixed.file, (height, width))
+def _mask(path: Path, camera: Camera) -> Mask:
+    mask = read_mask(path, (camera.height, camera.width))
     if mask is None:
-        raise DataError("no such mask", path=fixed.file)
+        raise DataError("no such mask", path=path)
     return mask
 
 
@@ -161,23 +154,17 @@ def find_unchanging_regions(
 
     ``sequences`` are folders with more images of these cameras: for queries, the map.
     """
-    chosen: dict[str, list[tuple[Path, Camera]]] = {}
     regions: dict[str, UnchangingRegion] = {}
     for sensor in sorted({sensor for _, sensor in folder.read().records_camera}):
         images = _images_of(sensor, [folder, *sequences])
         if len(images) < MIN_IMAGES:
             reason = f"it has {len(images)} images; at least {MIN_IMAGES} of a sequence are needed"
             regions[sensor] = UnchangingRegion((), reason)
-        else:
-            number = min(len(images), MAX_IMAGES)
-            rows = np.linspace(0, len(images) - 1, number).round().astype(int)
-            chosen[sensor] = [images[k] for k in rows]
-    jobs = [image for images in chosen.values() for image in images]
-    results = iter(work.map(_edges, jobs, "unchanging regions"))
-    for sensor, images in chosen.items():
-        regions[sensor] = find_unchanging_region(next(results) for _ in images)
-    for _ in results:  # exhaust the iterator so that the progress bar completes
-        pass
+            continue
+        number = min(len(images), MAX_IMAGES)
+        rows = np.linspace(0, len(images) - 1, number).round().astype(int)
+        edges = work.map(_edges, [images[k] for k in rows], "unchanging regions")
+        regions[sensor] = find_unchanging_region(edges)
     return regions
 
 
@@ -303,7 +290,7 @@ def _process(
         image,
         plan,
         lambda: read_image_of(source, camera),
-        lambda: {**read_masks(mask_paths, (camera.height, camera.width)), **standing},
+        lambda: {**{key: _mask(path, camera) for key, path in mask_paths.items()}, **standing},
         lambda: classes,
     )
     if plan.changes_pixels:
@@ -342,7 +329,9 @@ def preprocess_images(
         raise OutputError(f"{output}: is inside the input kapture folder, which is not modified")
     classes = options.masks.make_classes(work.placement)
     data = folder.read()
-    plans = _plans(data, options)
+    records = sorted(data.records_camera.items(), reverse=True)
+    first_image = {sensor: image for (_, sensor), image in records}
+    plans = {sensor: options.plan(data.camera_of(image)) for sensor, image in first_image.items()}
     images = data.image_names()
     files = mask_files(folder, images, options.masks.user_masks)
     regions: dict[str, UnchangingRegion] = {}
@@ -373,7 +362,7 @@ def preprocess_images(
                 for mask in fixed
                 if mask.is_for(sensor, image) and not (mask.fallback and region)
             )
-            standing = standing_masks(applied, region, plan.original.width, plan.original.height)
+            standing = standing_masks(applied, region, plan.original)
             yield image, folder.image_path(image), plan, link, files[image], standing
 
     plugins = () if classes is None else (classes.segmenter,)
@@ -392,14 +381,6 @@ def preprocess_images(
         "images_masked": num_masked,
         **{f"masked_{source}": shares[source] / len(images) for source in sorted(shares)},
     }
-
-
-def _plans(data: KaptureData, options: PreprocessingOptions) -> dict[str, FramePlan]:
-    plans: dict[str, FramePlan] = {}
-    for (_, sensor_id), image in sorted(data.records_camera.items()):
-        if sensor_id not in plans:
-            plans[sensor_id] = options.plan(data.camera_of(image))
-    return plans
 
 
 def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> list[str]:
