@@ -30,7 +30,6 @@ from megloc_kapture.io.files import link_images, link_records, remove, safe_join
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import DepthRow
-from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.depth import lift_with_covariances
 from megloc_kapture.mvs.views import (
     TOLERANCE_PX,
@@ -56,6 +55,7 @@ from megloc_kapture.stages.scene import (
     check_points,
     depth_records,
     indices_of,
+    points_seen,
     with_noise,
     write_array,
 )
@@ -72,7 +72,6 @@ from megloc_kapture.stages.stereo_depth import (
 from megloc_kapture.stages.work import HERE, Work, is_out_of_memory
 from megloc_kapture.values import Camera, Options
 
-_NO_POINTS = np.zeros(0, np.int64)
 _ANCHOR_VIEWS = 2  # views that must agree with a keypoint's depth before it is lifted
 # median reprojection error with exact poses, in image pixels; the excess is attributed to the poses
 _KEYPOINT_ERROR_PX = 0.3
@@ -145,15 +144,14 @@ def densify_map(
     )
     data = source.read()
     fit = fitted_to_poses(source, options.max_size_px)
-    indices = indices_of(source)
-    rows = _plan(source, indices, fit, tables)
+    rows = _plan(source, fit, tables)
     scratch = output / f".{FOLDER}"
     planned = [row for row in rows if not row.reason]
     estimate = partial(_estimate, source, scratch, fit, estimator)
     reasons = work.map(estimate, planned, "depth", plugins=(estimator,))
     reason_of = {row.image: reason for row, reason in zip(planned, reasons, strict=True)}
     rows = [replace(row, reason=reason_of.get(row.image, row.reason)) for row in rows]
-    lifts = indices if options.mode == "points" else ()
+    lifts = indices_of(source) if options.mode == "points" else ()
     jobs = [
         (row, {index.local_type: index.observed(row.image)[0] for index in lifts})
         for row in rows
@@ -214,7 +212,6 @@ def fitted_to_poses(source: KaptureFolder, max_size_px: int) -> StereoFit:
 
 def _plan(
     source: KaptureFolder,
-    indices: Sequence[MapIndex],
     fit: StereoFit,
     tables: SideTables,
 ) -> list[DepthRow]:
@@ -222,12 +219,9 @@ def _plan(
     data, xyz = source.read(), source.points3d()[:, :3]
     poses = data.poses()
     images = list(poses)
-    points_of = [
-        np.unique(np.concatenate([_NO_POINTS, *(index.observed(image)[1] for index in indices)]))
-        for image in images
-    ]
+    points_of = [points_seen(source, image) for image in images]
     counts = [len(points) for points in points_of]
-    point_ids = np.concatenate([_NO_POINTS, *points_of])
+    point_ids = np.concatenate(points_of)
     order = np.argsort(point_ids, kind="stable")
     starts = np.zeros(len(xyz) + 1, np.int64)
     np.cumsum(np.bincount(point_ids, minlength=len(xyz)), out=starts[1:])

@@ -6,7 +6,7 @@ observations are transferred to extracted keypoints at the same positions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -61,16 +61,30 @@ def move_points(
     xyz_rgb = model.points3d()
     kept = np.bincount(moved.point_ids, minlength=len(xyz_rgb)) > 0
     number = np.cumsum(kept) - 1
-    write_sensors(output, model.read())
-    link_images(model.root, output)
-    write_points3d(output, xyz_rgb[kept])
-    write_observations(output, {local_type: replace(moved, point_ids=number[moved.point_ids])})
+    moved = replace(moved, point_ids=number[moved.point_ids])
+    write_map(model, output, xyz_rgb[kept], {local_type: moved})
     return {
         "images": len(np.unique(moved.image_ids)),
         "points": int(kept.sum()),
         "observations": len(moved),
         "share_found_again": round(num_found / len(seen), 4),
     }
+
+
+def write_map(
+    source: KaptureFolder,
+    output: Path,
+    points: NDArray[np.float64],
+    observations: Mapping[str, Observations],
+) -> None:
+    """Write the sensors, poses and images (links) of ``source``, and new points and observations.
+
+    ``points`` (N, 6) have colours, 0 where unknown.
+    """
+    write_sensors(output, source.read())
+    link_images(source.root, output)
+    write_points3d(output, points)
+    write_observations(output, observations)
 
 
 def _moved(

@@ -11,21 +11,13 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
-from megloc_kapture.io.files import link_images
-from megloc_kapture.io.kapture import (
-    ImagePair,
-    KaptureFolder,
-    Observations,
-    write_observations,
-    write_points3d,
-    write_sensors,
-)
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, Observations
 from megloc_kapture.io.kapture.features import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import warn_of_other_size
-from megloc_kapture.stages.map_features import copy_features
+from megloc_kapture.stages.map_features import copy_features, write_map
 from megloc_kapture.stages.scene import depth_of, depth_records
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
@@ -196,13 +188,9 @@ def _write_map(
     xyz: NDArray[np.float64],
     observations: Mapping[str, Observations],
 ) -> None:
-    write_sensors(output, mapping.read())
-    link_images(mapping.root, output)
+    write_map(mapping, output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1), observations)
     # also copy the base type of a pyramid type, as queries are first matched with the base type
     copy_features(mapping, output, {*observations, *map(base_type, observations)})
-    # kapture stores a colour per point; black means unknown
-    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
-    write_observations(output, observations)
 
 
 class MakePoints(PipelineStage):

@@ -25,15 +25,8 @@ from megloc_kapture.io.dataset_tables import (
     SideTables,
     read_side_tables,
 )
-from megloc_kapture.io.files import link_images, write_json
-from megloc_kapture.io.kapture import (
-    KaptureData,
-    KaptureFolder,
-    Observations,
-    write_observations,
-    write_points3d,
-    write_sensors,
-)
+from megloc_kapture.io.files import write_json
+from megloc_kapture.io.kapture import KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.mapping.depth import (
     KEYPOINT_NOISE_PX,
@@ -51,7 +44,7 @@ from megloc_kapture.mapping.uncertainty import (
 )
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages import paths
-from megloc_kapture.stages.map_features import copy_features
+from megloc_kapture.stages.map_features import copy_features, write_map
 from megloc_kapture.stages.scene import check_points, depth_of, depth_records
 from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
@@ -73,7 +66,7 @@ class MapSelection:
 
     def __init__(self, source: KaptureFolder) -> None:
         self.source = source
-        self.data: KaptureData = source.read()
+        self.data = source.read()
         self.xyz = np.ascontiguousarray(source.points3d()[:, :3])
         self._of_type = source.observations()
         types = list(self._of_type.values())
@@ -188,11 +181,8 @@ def refine_map(
         _reject_uncertain(selection, options.uncertainty.max_robust_sigmas)
     kept = selection.kept_points
     num_points, num_observations = int(kept.sum()), int(selection.kept.sum())
-    write_sensors(output, selection.data)
-    link_images(source.root, output)
+    write_map(source, output, source.points3d()[kept], selection.observations())
     copy_features(source, output, link_own=link_features)
-    write_points3d(output, source.points3d()[kept])
-    write_observations(output, selection.observations())
     write_point_covariances(output, selection.covariances()[kept])
     report = {
         "points_before": len(selection.xyz),

@@ -117,16 +117,6 @@ def _finite_median(parts: Sequence[NDArray[np.float64]]) -> float:
     return float(np.median(values)) if len(values) else math.nan
 
 
-def write_index(index: MapIndex, folder: Path) -> None:
-    """Write arrays as npy files, which processes can share, and other fields as JSON."""
-    values = {field.name: getattr(index, field.name) for field in fields(index)}
-    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-    for name, array in arrays.items():
-        write_array(folder / f"{name}.npy", array)
-    others = {name: value for name, value in values.items() if name not in arrays}
-    write_bytes(folder / "index.json", json.dumps(others).encode())
-
-
 def open_index(folder: Path) -> MapIndex:
     values = json.loads((folder / "index.json").read_bytes())
     for file in folder.glob("*.npy"):
@@ -141,12 +131,16 @@ def shared_index(
 ) -> Iterator[dict[str, Path]]:
     """Write indices, by keypoints type, to temporary folders that other processes can open.
 
-    Opened indices stay valid after the folders are removed.
+    Arrays are npy files, which processes can share, other fields are in a JSON file. Opened indices
+    stay valid after the folders are removed.
     """
     with TemporaryDirectory(prefix=TEMPORARY, dir=scratch) as place:
         folders = {name: Path(place) / str(at) for at, name in enumerate(indices)}
         for name, folder in folders.items():
-            write_index(indices[name], folder)
+            values = {each.name: getattr(indices[name], each.name) for each in fields(MapIndex)}
+            for array in [key for key, value in values.items() if isinstance(value, np.ndarray)]:
+                write_array(folder / f"{array}.npy", values.pop(array))
+            write_bytes(folder / "index.json", json.dumps(values).encode())
         yield folders
 
 
@@ -264,9 +258,6 @@ def _mounts(data: KaptureData) -> dict[str, dict[str, RigidTransform]]:
     return mounts
 
 
-_NO_POINTS = np.zeros(0, np.int64)
-
-
 @lru_cache(maxsize=4)
 def _depth_records_of(folder: KaptureFolder) -> dict[str, DepthRecord]:
     return depth_records(folder.read())
@@ -275,6 +266,12 @@ def _depth_records_of(folder: KaptureFolder) -> dict[str, DepthRecord]:
 @lru_cache(maxsize=4)
 def indices_of(folder: KaptureFolder) -> list[MapIndex]:
     return [index_map(folder, local_type) for local_type in folder.observations()]
+
+
+def points_seen(folder: KaptureFolder, name: str) -> NDArray[np.int64]:
+    """Return the ids (P,) of the map points that an image observes, of all keypoints types."""
+    seen = [index.observed(name)[1] for index in indices_of(folder)]
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *seen]))
 
 
 def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
@@ -327,8 +324,7 @@ class KaptureScene:
         return depth_of(self._map, name)
 
     def map_points(self, name: str) -> NDArray[np.float64]:
-        seen = [index.observed(name)[1] for index in indices_of(self._map)]
-        return self._map.points3d()[:, :3][np.unique(np.concatenate([_NO_POINTS, *seen]))]
+        return self._map.points3d()[:, :3][points_seen(self._map, name)]
 
     def map_pose(self, name: str) -> RigidTransform:
         pose = self._map.read().cam_from_world(name)
