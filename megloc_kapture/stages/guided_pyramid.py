@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,7 +24,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.files import hard_link
 from megloc_kapture.io.kapture import (
     FeatureWriter,
     ImagePair,
@@ -32,7 +31,6 @@ from megloc_kapture.io.kapture import (
     MatchesWriter,
     read_pairs,
 )
-from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.mapping.pairs import views_can_overlap
@@ -167,11 +165,7 @@ class PyramidFeatures:
         # the configurations keep their ``name``, which identifies the extractor
         configs = keypoints.config, replace(descriptors.config, keypoints_type=name)
         self._kinds = [
-            (
-                source,
-                FeatureWriter(output, source.kind, name, config, orphan=True),
-                feature_folder(output, source.kind, name, orphan=True),
-            )
+            (source, FeatureWriter(output, source.kind, name, config, orphan=True))
             for source, config in zip((keypoints, descriptors), configs, strict=True)
         ]
 
@@ -179,20 +173,15 @@ class PyramidFeatures:
         self, image: str, added_px: NDArray[np.float32], added_descriptors: NDArray[Any]
     ) -> None:
         self._left.remove(image)
-        added = (added_px, added_descriptors)
-        for (source, writer, folder), more in zip(self._kinds, added, strict=True):
-            stored = Path(source.where(image))
-            if len(more) == 0 and stored.is_file():  # members of a tar cannot be linked
-                hard_link(stored, folder / f"{image}{SUFFIX[source.kind]}")
+        for (source, writer), added in zip(self._kinds, (added_px, added_descriptors), strict=True):
+            if len(added):
+                writer.write(image, np.concatenate([source.read(image), added]))
             else:
-                writer.write(image, np.concatenate([source.read(image), more]))
+                writer.copy(image, source)
 
     def write_rest(self) -> None:
-        px, descriptors = (
-            np.zeros((0, source.config.dsize), source.config.dtype) for source, *_ in self._kinds
-        )
-        for image in list(self._left):
-            self.write(image, px, descriptors)
+        for image, (source, writer) in product(self._left, self._kinds):
+            writer.copy(image, source)
 
 
 @dataclass(frozen=True, eq=False)

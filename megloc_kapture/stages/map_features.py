@@ -25,7 +25,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
+from megloc_kapture.io.kapture.features import ArrayKind
 from megloc_kapture.io.kapture.folder import ARRAY_KINDS
 from megloc_kapture.mapping.uncertainty import rows_of_each
 
@@ -186,20 +186,14 @@ def copy_features(
 def _copy_type(
     source: KaptureFolder, output: Path, kind: ArrayKind, type_name: str, *, link_own: bool
 ) -> None:
-    copies = output / "reconstruction" / kind / type_name
     reader, reconstruction = source.features(kind, type_name), source.root / "reconstruction"
     writer = FeatureWriter(output, kind, type_name, reader.config)
     for image in filter(reader.__contains__, source.read().image_names()):
-        file = Path(reader.where(image))
-        if file.is_file() and (link_own or not file.is_relative_to(reconstruction)):
-            hard_link(file, copies / f"{image}{SUFFIX[kind]}")
-        else:  # user data, or a member of a tar
-            writer.write(image, reader.read(image))
+        is_own = Path(reader.where(image)).is_relative_to(reconstruction)
+        writer.copy(image, reader, link=link_own or not is_own)
     if kind == "global_features":
-        folders = [
-            reconstruction / kind / type_name,
-            *(d / kind / type_name for d in source.features_dirs),
-        ]
+        copies = output / "reconstruction" / kind / type_name
+        folders = [root / kind / type_name for root in (reconstruction, *source.features_dirs)]
         for folder, name in product(folders, _VLAD_FILES):
             if (folder / name).is_file() and not (copies / name).exists():
                 hard_link(folder / name, copies / name)

@@ -29,6 +29,7 @@ from megloc_kapture.errors import DataError, OutputError, require
 from megloc_kapture.io.files import (
     check_component,
     check_relative,
+    hard_link,
     named,
     reading,
     safe_join,
@@ -338,7 +339,7 @@ class FeatureWriter:
             raise OutputError(f"{path}: has another configuration; remove its folder first")
 
     def __contains__(self, image: str) -> bool:
-        return safe_join(self._folder, image + SUFFIX[self.kind]).is_file()
+        return self._path(image).is_file()
 
     def write(self, image: str, array: ArrayLike) -> None:
         """Write an image's array, (N, dsize) or (dsize,)."""
@@ -348,8 +349,18 @@ class FeatureWriter:
             f"image {image}: {content.shape[-1]} columns, but {self.config.dsize} in the "
             f"{self.kind} of other images",
         )
-        path = safe_join(self._folder, image + SUFFIX[self.kind])
-        write_bytes(path, content.tobytes())
+        write_bytes(self._path(image), content.tobytes())
+
+    def copy(self, image: str, source: FeatureReader, *, link: bool = True) -> None:
+        """Copy an image's array; with ``link``, hard-link its file if it is not in a tar."""
+        file = Path(source.where(image))
+        if link and file.is_file():
+            hard_link(file, self._path(image))
+        else:
+            self.write(image, source.read(image))
+
+    def _path(self, image: str) -> Path:
+        return safe_join(self._folder, image + SUFFIX[self.kind])
 
 
 # ------------------------------------------------------------------------------------ matches
