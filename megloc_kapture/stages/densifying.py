@@ -144,34 +144,32 @@ def densify_map(
     )
     data = source.read()
     fit = fitted_to_poses(source, options.max_size_px)
-    rows = _plan(source, fit, tables)
+    rows = {row.image: row for row in _plan(source, fit, tables)}
     scratch = output / f".{FOLDER}"
-    planned = [row for row in rows if not row.reason]
+    planned = [row for row in rows.values() if not row.reason]
     estimate = partial(_estimate, source, scratch, fit, estimator)
-    reasons = work.map(estimate, planned, "depth", plugins=(estimator,))
-    reason_of = {row.image: reason for row, reason in zip(planned, reasons, strict=True)}
-    rows = [replace(row, reason=reason_of.get(row.image, row.reason)) for row in rows]
+    estimated = work.map(estimate, planned, "depth", plugins=(estimator,))
+    rows |= {row.image: row for row in estimated}
     lifts = indices_of(source) if options.mode == "points" else ()
     jobs = [
         (row, {index.local_type: index.observed(row.image)[0] for index in lifts})
-        for row in rows
+        for row in rows.values()
         if not row.reason
     ]
     lifted: dict[str, dict[str, LiftedPoints]] = {}
-    fills = {}
     results = work.map(partial(_confirm, source, scratch, output, fit), jobs, "agreement")
-    for (row, _), (fill, points_of_type) in zip(jobs, results, strict=True):
-        fills[row.image] = fill
+    for row, points_of_type in results:
+        rows[row.image] = row
         for local_type, points in points_of_type.items():
             lifted.setdefault(local_type, {})[row.image] = points
     remove(scratch)
-    rows = [replace(row, fill=fills.get(row.image, 0.0)) for row in rows]
+    fills = {row.image: rows[row.image].fill for row, _ in jobs}
     write_sensors(output, with_depth_sensors(data, list(fills), fit.max_size_px))
     link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
     link_images(source.root, output, ("masks",))
     copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
-    write_records(output / DEPTH_FILE, DepthRow, rows)
+    write_records(output / DEPTH_FILE, DepthRow, rows.values())
     return {
         "images": len(rows),
         "images_with_depth": len(fills),
@@ -271,21 +269,21 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
 
 def _estimate(
     folder: KaptureFolder, scratch: Path, fit: StereoFit, estimator: DepthEstimator, row: DepthRow
-) -> str:
-    """Estimate an image's depth into the scratch folder; return the reason if it fails, else ""."""
+) -> DepthRow:
+    """Estimate an image's depth into the scratch folder; add the reason to its row if it fails."""
     try:
         views = [_view(folder, image, fit.max_size_px) for image in (row.image, *row.sources)]
         estimate = estimator.estimate(views[0], views[1:], (row.near_m, row.far_m))
     except MeglocError as error:
-        return str(error)
+        return replace(row, reason=str(error))
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
-        return "out of memory; make mvs.max_size_px smaller"
+        return replace(row, reason="out of memory; make mvs.max_size_px smaller")
     file = _scratch_file(scratch, row.image)
     file.parent.mkdir(parents=True, exist_ok=True)
     np.savez(file, **vars(estimate))
-    return ""
+    return row
 
 
 def _confirm(
@@ -294,8 +292,8 @@ def _confirm(
     out: Path,
     fit: StereoFit,
     job: tuple[DepthRow, Mapping[str, NDArray[np.int32]]],
-) -> tuple[float, dict[str, LiftedPoints]]:
-    """Write the depth that sources confirm; return its share of the pixels, and lifted points.
+) -> tuple[DepthRow, dict[str, LiftedPoints]]:
+    """Write the depth that sources confirm; return the row with its share, and lifted points.
 
     A job has the row of an image, and its keypoints that observe a point, which are not lifted.
     """
@@ -328,7 +326,7 @@ def _confirm(
                 keypoints = np.asarray(reader.read(image))
                 unseen = np.setdiff1d(np.arange(len(keypoints)), seen)
                 lifted[local_type] = _lift(keypoints, unseen, camera, view, sure, kept.sigma_m)
-    return float((kept.depth_m > 0).mean()), lifted
+    return replace(row, fill=float((kept.depth_m > 0).mean())), lifted
 
 
 def _lift(

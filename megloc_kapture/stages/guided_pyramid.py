@@ -441,6 +441,12 @@ class _Rematching(PipelineStage):
     version = 4
     matches: ClassVar[str]
     of_queries: ClassVar[bool]
+    uses: ClassVar[tuple[str, ...]] = (
+        *MATCHING_OPTIONS,
+        "second_matching",
+        "guided_pyramid",
+        "mask_margin_px",
+    )
     explained_by: ClassVar[tuple[str, ...]] = (
         "second_matching.matcher",
         "second_matching.min_matches",
@@ -504,13 +510,7 @@ class RematchMapping(_Rematching):
 
     name = "mapping_rematching"
     matches, of_queries = paths.MAPPING_MATCHES, False
-    uses = (
-        *MATCHING_OPTIONS,
-        "mapping_verification",
-        "second_matching",
-        "guided_pyramid",
-        "mask_margin_px",
-    )
+    uses = (*_Rematching.uses, "mapping_verification")
     inputs = (
         PipelineStage.mapping,
         paths.LOCAL_FEATURES,
@@ -534,14 +534,7 @@ class RematchQueries(_Rematching):
     name = "query_rematching"
     explained_by = ("second_matching.queries", *_Rematching.explained_by)
     matches, of_queries = paths.QUERY_MATCHES, True
-    uses = (
-        *MATCHING_OPTIONS,
-        "map",
-        "query_verification",
-        "second_matching",
-        "guided_pyramid",
-        "mask_margin_px",
-    )
+    uses = (*_Rematching.uses, "map", "query_verification")
     inputs = (
         PipelineStage.mapping,
         PipelineStage.query,

@@ -34,14 +34,8 @@ def triangulate_map(
 ) -> dict[str, float]:
     """Triangulate with fixed poses and intrinsics, write the map, and return counts for the log.
 
-    Each keypoints type has separate points; those of the first type come first.
-
-    Parameters
-    ----------
-    mapping : folder of the images with their keypoints and verified matches.
-    local_types : keypoints types; duplicates are ignored.
-    pairs : restrict the matches to these pairs.
-    num_threads : threads of COLMAP.
+    Each keypoints type has separate points; those of the first type come first. ``pairs`` restrict
+    the matches.
     """
     types = tuple(dict.fromkeys(local_types))
     data = mapping.read()
