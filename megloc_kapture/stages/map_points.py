@@ -18,7 +18,7 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import warn_of_other_size
 from megloc_kapture.stages.map_features import copy_features, write_map
-from megloc_kapture.stages.scene import depth_of, depth_records
+from megloc_kapture.stages.scene import depth_and_pose, depth_records
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
 
@@ -123,10 +123,7 @@ def lift_map(
     work: Work = HERE,
 ) -> dict[str, float]:
     """Backproject keypoints with depth maps and write the map; return counts for the log."""
-    data = mapping.read()
-    poses = data.poses()
-    records = depth_records(data)
-    images = sorted(poses)
+    records, images = depth_records(mapping.read()), list(mapping.read().poses())
     with_depth = [image for image in images if image in records]
     require(
         with_depth,
@@ -134,27 +131,19 @@ def lift_map(
         "rig with camera and depth sensor)",
         path=mapping.root,
     )
-    row_of = {image: row for row, image in enumerate(images)}
     points: list[NDArray[np.float64]] = []
     seen: dict[str, Observations] = {}
-    total = 0
     for local_type in local_types:
-        image_ids: list[NDArray[np.int32]] = []
-        keypoint_ids: list[NDArray[np.int32]] = []
         lift = partial(_lift, mapping, local_type)
-        results = work.map(lift, with_depth, f"lifting {local_type}")
-        for image, (lifted, ids) in zip(with_depth, results, strict=True):
-            points.append(poses[image].inverse().apply(lifted))
-            image_ids.append(np.full(len(ids), row_of[image], np.int32))
-            keypoint_ids.append(ids)
-        keypoints = np.concatenate(keypoint_ids)
+        lifted = list(work.map(lift, with_depth, f"lifting {local_type}"))
+        counts = [len(ids) for _, ids in lifted]
         seen[local_type] = Observations(
-            image_names=tuple(images),
-            point_ids=total + np.arange(len(keypoints)),
-            image_ids=np.concatenate(image_ids),
-            keypoint_ids=keypoints,
+            image_names=tuple(with_depth),
+            point_ids=sum(map(len, points)) + np.arange(sum(counts)),
+            image_ids=np.repeat(np.arange(len(with_depth), dtype=np.int32), counts),
+            keypoint_ids=np.concatenate([ids for _, ids in lifted]),
         )
-        total += len(keypoints)
+        points += [xyz for xyz, _ in lifted]
     xyz = np.concatenate(points)
     _write_map(mapping, output, xyz, seen)
     return {"images": len(images), "images_with_depth": len(with_depth), "points": len(xyz)}
@@ -163,9 +152,8 @@ def lift_map(
 def _lift(
     mapping: KaptureFolder, local_type: str, image: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Return points in the camera frame (N, 3) and their keypoint ids (N,)."""
-    depth = depth_of(mapping, image)
-    assert depth is not None
+    """Return points in the world (N, 3) and their keypoint ids (N,)."""
+    depth, cam_from_world = depth_and_pose(mapping, image)
     points, valid = lift_keypoints(
         mapping.keypoints(local_type).read(image),
         depth.depth_m,
@@ -173,7 +161,7 @@ def _lift(
         depth.camera,
         depth.image_from_depth,
     )
-    return points[valid], np.flatnonzero(valid).astype(np.int32)
+    return cam_from_world.inverse().apply(points[valid]), np.flatnonzero(valid).astype(np.int32)
 
 
 def _write_map(

@@ -42,13 +42,12 @@ from megloc_kapture.mapping.uncertainty import (
     rows_of_each,
     too_uncertain,
 )
-from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages import paths
 from megloc_kapture.stages.map_features import copy_features, write_map
-from megloc_kapture.stages.scene import check_points, depth_of, depth_records
+from megloc_kapture.stages.scene import check_points, depth_and_pose, depth_records
 from megloc_kapture.stages.stage import PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Options, RigidTransform
+from megloc_kapture.values import Options
 
 # a point that loses observations is dropped if fewer than this remain
 _MIN_OBSERVATIONS = 2
@@ -327,7 +326,7 @@ def _judge(
     images, xyz, sigmas = job
     through, agreeing = np.zeros((2, len(xyz)), dtype=bool)
     for image in images:
-        depth, cam_from_world = _depth_and_pose(folder, image)
+        depth, cam_from_world = depth_and_pose(folder, image)
         points = cam_from_world.apply(xyz)
         before, behind, checked = compare_with_depth(points, depth, options, sigmas)
         through |= before
@@ -342,18 +341,12 @@ def _compare(
 ) -> tuple[Mask, int]:
     """Return a mask of points that an image's depth contradicts, and the number with depth."""
     image, xyz, covariances = job
-    depth, cam_from_world = _depth_and_pose(folder, image)
+    depth, cam_from_world = depth_and_pose(folder, image)
     axis = (depth.image_from_depth.inverse() @ cam_from_world).rotation_matrix()[2]
     sigmas = KEYPOINT_NOISE_PX * np.sqrt(_quadratic_form(covariances, axis))
     points = cam_from_world.apply(xyz)
     before, behind, checked = compare_with_depth(points, depth, options, sigmas)
     return before | behind, int(checked.sum())
-
-
-def _depth_and_pose(folder: KaptureFolder, image: str) -> tuple[DepthView, RigidTransform]:
-    depth, cam_from_world = depth_of(folder, image), folder.read().cam_from_world(image)
-    assert depth is not None and cam_from_world is not None
-    return depth, cam_from_world
 
 
 def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:

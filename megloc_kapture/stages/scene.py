@@ -284,6 +284,13 @@ def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
     return DepthView(camera, depth_m, record.image_from_depth)
 
 
+def depth_and_pose(folder: KaptureFolder, name: str) -> tuple[DepthView, RigidTransform]:
+    """Return the depth and the pose of an image that has both."""
+    depth, cam_from_world = depth_of(folder, name), folder.read().cam_from_world(name)
+    assert depth is not None and cam_from_world is not None
+    return depth, cam_from_world
+
+
 def _mask_of(folder: KaptureFolder, name: str) -> NDArray[np.bool_] | None:
     camera = folder.read().camera_of(name)
     return read_mask(mask_path(folder, name), (camera.height, camera.width))

@@ -40,7 +40,7 @@ from megloc_kapture.mvs.views import (
 )
 from megloc_kapture.plugins import StereoView
 from megloc_kapture.stages.local_features import read_stored_image
-from megloc_kapture.stages.scene import depth_of
+from megloc_kapture.stages.scene import depth_and_pose
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import RigidTransform
 
@@ -189,10 +189,8 @@ def _points(
 
 
 def _view_with_depth(folder: KaptureFolder, image: str) -> tuple[StereoView, NDArray[np.float32]]:
-    data, depth = folder.read(), depth_of(folder, image)
-    pose = data.cam_from_world(image)
-    assert depth is not None and pose is not None
+    depth, pose = depth_and_pose(folder, image)
     pixels = read_stored_image(folder, image)
     longer = max(depth.camera.width, depth.camera.height)
-    view = stereo_view(pixels, data.camera_of(image), pose, None, longer)
+    view = stereo_view(pixels, folder.read().camera_of(image), pose, None, longer)
     return view, depth.depth_m
