@@ -5,24 +5,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-
-from numba import get_num_threads
 
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.projection import PINHOLES, distorted
 
 # a point is undetermined if a pivot of its information matrix is at most this share of the trace
 _MIN_RATIO = 1e-13
-
-
-def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(first, last)`` for chunks ``first:last`` of ``range(count)``, in threads."""
-    starts = range(0, count, size)
-    with ThreadPoolExecutor(get_num_threads()) as executor:  # one per available core
-        for _ in executor.map(work, starts, [min(first + size, count) for first in starts]):
-            pass
 
 
 @compiled_loop

@@ -11,6 +11,7 @@ distortion.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +38,10 @@ def point_covariances(
     Observations (O,) are in any order; those with the point behind the camera are ignored. NaN if
     the observations do not determine the point.
     """
+    from numba import get_num_threads  # numba loads slowly
+
     from megloc_kapture.geometry.projection import packed_views
-    from megloc_kapture.mapping import kernels
+    from megloc_kapture.mapping.kernels import covariances_of_points
 
     out = np.full((len(xyz), 6), np.nan)
     if len(image_ids) == 0:
@@ -51,9 +54,13 @@ def point_covariances(
         *packed_views(cameras, cams_from_world),
         out,
     )
-    kernels.in_chunks(
-        len(xyz), _CHUNK, lambda a, b: kernels.covariances_of_points(a, b, *arguments)
-    )
+
+    def compute(first: int) -> None:
+        last = min(first + _CHUNK, len(xyz))
+        covariances_of_points(first, last, *arguments)
+
+    with ThreadPoolExecutor(get_num_threads()) as executor:  # one per available core
+        list(executor.map(compute, range(0, len(xyz), _CHUNK)))
     return out
 
 

@@ -208,11 +208,7 @@ def fitted_to_poses(source: KaptureFolder, max_size_px: int) -> StereoFit:
     )
 
 
-def _plan(
-    source: KaptureFolder,
-    fit: StereoFit,
-    tables: SideTables,
-) -> list[DepthRow]:
+def _plan(source: KaptureFolder, fit: StereoFit, tables: SideTables) -> list[DepthRow]:
     """Return a row per image, with sources and depth range, or the reason why it has no depth."""
     data, xyz = source.read(), source.points3d()[:, :3]
     poses = data.poses()
@@ -221,38 +217,31 @@ def _plan(
     counts = [len(points) for points in points_of]
     point_ids = np.concatenate(points_of)
     order = np.argsort(point_ids, kind="stable")
-    starts = np.zeros(len(xyz) + 1, np.int64)
-    np.cumsum(np.bincount(point_ids, minlength=len(xyz)), out=starts[1:])
+    starts = np.append(0, np.cumsum(np.bincount(point_ids, minlength=len(xyz))))
     images_of = starts, np.repeat(np.arange(len(images)), counts)[order]
     centers = np.array([pose.center() for pose in poses.values()]).reshape(-1, 3)
-    members: dict[tuple[str, str, str], NDArray[np.bool_]] = {}
     session = attrgetter("frame", "location", "condition")
-    keys = [session(tables.groups.get(image, ImageGroup())) for image in images]
-    for row, key in enumerate(keys):
-        members.setdefault(key, np.zeros(len(images), bool))[row] = True
+    sessions = [session(tables.groups.get(image, ImageGroup())) for image in images]
+    session_ids = np.unique(sessions, axis=0, return_inverse=True)[1].ravel()
     has_depth = depth_records(data)
-    rows = []
-    for row, image in enumerate(images):
+
+    def planned(row: int, image: str) -> DepthRow:
         blank = DepthRow(image, (), 0.0, 0.0, 0.0, "")
         if image in has_depth:
-            rows.append(replace(blank, reason="already has depth"))
-            continue
+            return replace(blank, reason="already has depth")
         if not source.image_path(image).is_file():
-            rows.append(replace(blank, reason="no image file"))
-            continue
+            return replace(blank, reason="no image file")
         limits = depth_range(poses[image].apply(xyz[points_of[row]])[:, 2])
-        chosen = choose_sources(
-            row, members[keys[row]], xyz, points_of, images_of, centers, fit.num_sources
-        )
-        sources = tuple(
-            images[other] for other in chosen if source.image_path(images[other]).is_file()
-        )
-        if limits is None or not sources:
-            reason = "too few visible points" if limits is None else "no image shares points"
-            rows.append(replace(blank, reason=reason))
-            continue
-        rows.append(replace(blank, sources=sources, near_m=limits[0], far_m=limits[1]))
-    return rows
+        if limits is None:
+            return replace(blank, reason="too few visible points")
+        members = session_ids == session_ids[row]
+        chosen = choose_sources(row, members, xyz, points_of, images_of, centers, fit.num_sources)
+        found = [images[other] for other in chosen if source.image_path(images[other]).is_file()]
+        if not found:
+            return replace(blank, reason="no image shares points")
+        return replace(blank, sources=tuple(found), near_m=limits[0], far_m=limits[1])
+
+    return [planned(row, image) for row, image in enumerate(images)]
 
 
 # ------------------------------------------------------------------------------------- images

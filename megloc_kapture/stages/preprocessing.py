@@ -172,8 +172,6 @@ def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[tuple[Path
     images: list[tuple[Path, Camera]] = []
     for folder in folders:
         data = folder.read()
-        if sensor not in data.sensors or data.sensors[sensor].sensor_type != "camera":
-            continue
         records = sorted((t, image) for (t, s), image in data.records_camera.items() if s == sensor)
         for _, image in records:
             camera = data.camera_of(image)
