@@ -36,14 +36,7 @@ from megloc_kapture.stages.map_features import (
 )
 from megloc_kapture.stages.scene import write_array
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import (
-    HERE,
-    Batched,
-    Work,
-    in_batches,
-    ordered_map,
-    resumed_label,
-)
+from megloc_kapture.stages.work import HERE, Batched, Work, in_batches, ordered_map
 from megloc_kapture.values import Options
 
 
@@ -109,10 +102,11 @@ def _write_vectors(
     """Write vectors of all images (orphan layout); return the number of images."""
     folder_of = images_of(folders, "describe")
     is_written = partial(has_features, output, "global_features", type_name)
-    jobs = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
-    jobs.sort(key=size_of)  # images of equal size can share a batch
+    images, label = work.unfinished(folder_of, is_written, label)
+    # images of equal size can share a batch
+    jobs = sorted(((image, folder_of[image]) for image in images), key=size_of)
     writer: FeatureWriter | None = None
-    results = work.map(describe, jobs, resumed_label(label, len(folder_of), len(jobs)))
+    results = work.map(describe, jobs, label)
     for (image, _), vector in zip(jobs, results, strict=True):
         if writer is None:
             kind = np.dtype(np.float32)

@@ -29,7 +29,7 @@ from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages import paths
 from megloc_kapture.stages.stage import LOCAL_TYPES, PipelineStage, StageWork
-from megloc_kapture.stages.work import HERE, Batched, Work, in_batches, resumed_label
+from megloc_kapture.stages.work import HERE, Batched, Work, in_batches
 from megloc_kapture.values import Camera, LocalFeatures
 
 _log = logging.getLogger(__name__)
@@ -49,8 +49,9 @@ def extract_local_features(
     """Write features of all images (orphan layout) without masked keypoints; return counts."""
     folder_of = images_of(folders, "extract features from")
     is_written = partial(has_features, output, "descriptors", extractor.name)
-    todo = [(image, folder_of[image]) for image in work.unfinished(folder_of, is_written)]
-    todo.sort(key=size_of)  # images of equal size can share a batch
+    images, label = work.unfinished(folder_of, is_written, f"{extractor.name} features")
+    # images of equal size can share a batch
+    todo = sorted(((image, folder_of[image]) for image in images), key=size_of)
     steps: Batched[Job, LocalFeatures] = Batched(
         partial(_read, mask_margin_px),
         partial(_extract, extractor),
@@ -60,9 +61,7 @@ def extract_local_features(
     )
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
     masked = 0
-    label = resumed_label(f"{extractor.name} features", len(folder_of), len(todo))
-    results = work.map(steps, todo, label)
-    for (image, _), features in zip(todo, results, strict=True):
+    for (image, _), features in zip(todo, work.map(steps, todo, label), strict=True):
         writers = writers or _writers(output, extractor, features)
         masked += features.num_masked
         writers[0].write(image, features.keypoints_px)

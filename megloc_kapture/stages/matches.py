@@ -47,14 +47,7 @@ from megloc_kapture.plugins import Matcher, PluginChoice
 from megloc_kapture.stages import paths
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.stage import PipelineStage, StageWork
-from megloc_kapture.stages.work import (
-    HERE,
-    Batched,
-    Work,
-    batched,
-    in_batches,
-    resumed_label,
-)
+from megloc_kapture.stages.work import HERE, Batched, Work, batched, in_batches
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
@@ -154,14 +147,16 @@ def match_pairs(
     counts: dict[tuple[str, str], PairCount] = {}
     if work.resume:
         counts = read_match_counts(output, local_type, missing_ok=True)
-    todo = work.unfinished(ordered, lambda pair: pair in writer and pair in counts)
+    todo, label = work.unfinished(
+        ordered, lambda pair: pair in writer and pair in counts, "matching"
+    )
     jobs: list[_Job] = []
     for image, group in groupby(todo, key=itemgetter(0)):
         jobs += [(image, some) for some in batched((b for _, b in group), _PAIRS_PER_ITEM)]
     folders = first, second
     verify = partial(_verify, folders, local_type, verification)
     steps = _matching(folders, local_type, matcher, verify)
-    results = work.map(steps, jobs, resumed_label("matching", len(ordered), len(todo)))
+    results = work.map(steps, jobs, label)
     for (image, others), verified_pairs in zip(jobs, results, strict=True):
         new_counts = [
             PairCount(image, other, pair.num_found, len(pair.matches))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -259,13 +259,13 @@ class Work:
             else:
                 yield from ordered_map(steps.finish, results, self.executor)
 
-    def unfinished(self, items: Iterable[Item], is_written: Callable[[Item], bool]) -> list[Item]:
-        """Return the items that an interrupted run of the stage has not written."""
-        return [item for item in items if not (self.resume and is_written(item))]
-
-
-def resumed_label(text: str, total: int, todo: int) -> str:
-    return f"{text}, {total - todo} kept" if todo < total else text
+    def unfinished(
+        self, items: Collection[Item], is_written: Callable[[Item], bool], label: str
+    ) -> tuple[list[Item], str]:
+        """Return the items that an interrupted run of the stage has not written, and a label."""
+        todo = [item for item in items if not (self.resume and is_written(item))]
+        kept = len(items) - len(todo)
+        return todo, f"{label}, {kept} kept" if kept else label
 
 
 def _alike(
