@@ -73,23 +73,20 @@ def rerank(
     Ties keep the retrieval order. ``of_types`` has, by type and candidate, the number of matches,
     or for ``coverage`` the matched keypoint rows (K,).
     """
-    num = len(of_types[0]) if of_types else 0
+    of_candidates = list(zip(*of_types, strict=True))
     if options.by == "coverage":
-        # keypoint k of type t gets a number of its own, k * (number of types) + t
+        # keypoint k of type t gets the number k * (number of types) + t
         keypoints = [
             np.concatenate(
-                [
-                    np.unique(np.asarray(type_rows[at])) * len(of_types) + number
-                    for number, type_rows in enumerate(of_types)
-                ]
+                [np.unique(rows) * len(of_types) + number for number, rows in enumerate(matched)]
             )
-            for at in range(num)
+            for matched in of_candidates
         ]
         return greedy_coverage(keypoints, options.keep)
-    counts = [sum(int(type_rows[at]) for type_rows in of_types) for at in range(num)]
-    order = list(range(num))
+    counts = [sum(map(int, matched)) for matched in of_candidates]
+    order = list(range(len(counts)))
     if options.reranks():
-        order = sorted(order, key=lambda at: (-counts[at], at))[: options.keep]
+        order = sorted(order, key=lambda at: -counts[at])[: options.keep]
     return order, [counts[at] for at in order]
 
 
