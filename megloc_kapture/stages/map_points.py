@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import MapImage, TriangulationOptions, triangulate
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, Observations
-from megloc_kapture.io.kapture.features import MatchesReader
+from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages import paths

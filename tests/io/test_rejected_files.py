@@ -25,6 +25,8 @@ from megloc_kapture.io.kapture.features import (
     list_types,
     open_folders,
     read_config,
+)
+from megloc_kapture.io.kapture.matches import (
     read_pairs,
 )
 from megloc_kapture.io.kapture.points import read_observations, read_points3d

@@ -1,17 +1,15 @@
 """kapture folders: the names that several other modules use."""
 
-from megloc_kapture.io.kapture.features import (
-    FeatureConfig,
-    FeatureReader,
-    FeatureWriter,
+from megloc_kapture.io.kapture.features import FeatureConfig, FeatureReader, FeatureWriter
+from megloc_kapture.io.kapture.folder import KaptureFolder
+from megloc_kapture.io.kapture.format import writable_name
+from megloc_kapture.io.kapture.matches import (
     ImagePair,
     MatchesReader,
     MatchesWriter,
     read_pairs,
     write_pairs,
 )
-from megloc_kapture.io.kapture.folder import KaptureFolder
-from megloc_kapture.io.kapture.format import writable_name
 from megloc_kapture.io.kapture.points import (
     Observations,
     read_point_covariances,

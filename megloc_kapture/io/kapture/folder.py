@@ -19,10 +19,12 @@ from megloc_kapture.io.kapture.features import (
     ArrayKind,
     FeatureKind,
     FeatureReader,
-    MatchesReader,
     feature_folder,
     features_dir_hint,
     list_types,
+)
+from megloc_kapture.io.kapture.matches import (
+    MatchesReader,
 )
 from megloc_kapture.io.kapture.points import Observations, read_observations, read_points3d
 from megloc_kapture.io.kapture.sensors import KaptureData, read_kapture_data

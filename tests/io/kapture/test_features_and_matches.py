@@ -16,14 +16,16 @@ from megloc_kapture.io.kapture.features import (
     FeatureConfig,
     FeatureReader,
     FeatureWriter,
-    ImagePair,
-    MatchesReader,
-    MatchesWriter,
     feature_folder,
     find_blob,
     list_blobs,
     list_types,
     open_folders,
+)
+from megloc_kapture.io.kapture.matches import (
+    ImagePair,
+    MatchesReader,
+    MatchesWriter,
     read_pairs,
     write_pairs,
 )
