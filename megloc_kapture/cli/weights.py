@@ -109,7 +109,7 @@ class Fetch(Common):
         self.say(f"{weights.name}: {url}")
         self.say(f"  licence: {weights.licence}: {weights.terms}")
         fetch(url, place, sha256=file.sha256, track=self.track)
-        downloaded = describe(weights.name, place)
+        downloaded = describe(weights.name, place, file)
         if file.sha256 is None and not file.convert:
             try:
                 read_weights(downloaded)
