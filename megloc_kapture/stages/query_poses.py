@@ -59,6 +59,7 @@ _FIRST_TURN = 8  # candidates that are matched first; each further turn doubles 
 # with fewer inliers even a correct pose can be off by decimetres, and matching more candidates
 # improves it (docs/performance.md)
 _SURE_INLIERS = 30
+_WRONG_RIG = "joint localization: the rig's poses of its cameras contradict their matches"
 
 
 class LocalizationOptions(Options):
@@ -175,15 +176,31 @@ def localize_query(
         )
         return replace(result, seconds={**seconds, **result.seconds}), problem
 
+    def alone(view: QueryView, candidates: Sequence[str]) -> Pose | Failure:
+        single = QueryView(view.name, view.camera, view.matches)
+        return replace(localize([single], candidates)[0], name=view.name)
+
+    def contradicts(of_rig: Pose | Failure, view: QueryView) -> bool:
+        """Return whether most matches of a camera agree on another pose than that of its rig."""
+        if 2 * of_rig.num_inliers >= of_rig.num_matches:
+            return False
+        single = alone(view, of_rig.candidates)
+        trusted = isinstance(single, Pose) and (single.confidence or 0.0) >= MIN_CONFIDENCE
+        return trusted and 2 * single.num_inliers > of_rig.num_matches
+
     def solve(count: int) -> list[Pose | Failure]:
         views = [source.view(count) for source in sources]
         candidates = interleave([source.candidates[:count] for source in sources])
+        remarks: tuple[str, ...] = ()
         if len(views) > 1:
             result, problem = localize(views, candidates)
             if isinstance(result, Pose) and problem is not None:
-                return poses_of_cameras(views, result, problem)
-        alone = [QueryView(view.name, view.camera, view.matches) for view in views]
-        return [replace(localize([view], candidates)[0], name=view.name) for view in alone]
+                cameras = poses_of_cameras(views, result, problem)
+                if not any(map(contradicts, cameras, views)):
+                    return cameras
+                remarks = (_WRONG_RIG,)
+        results = [alone(view, candidates) for view in views]
+        return [replace(each, remarks=(*each.remarks, *remarks)) for each in results]
 
     num_candidates = max((len(source.candidates) for source in sources), default=0)
     sure, count = options.sure_confidence, _FIRST_TURN
@@ -312,7 +329,7 @@ class LocalizeQueries(PipelineStage):
     """Estimate the poses of the queries from their matches with the map."""
 
     name = "localization"
-    version = 10
+    version = 11
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
     explained_by = (
         "localization.clusters.by",

@@ -176,6 +176,34 @@ def test_clusters_with_equal_poses_are_merged_within_a_frame(
     assert (len(found.clusters), found.num_matches) == (clusters, 100 // clusters)
 
 
+@pytest.mark.parametrize("error_m", [0.0, 0.6])
+def test_a_rig_that_contradicts_its_cameras_is_localized_camera_by_camera(error_m: float) -> None:
+    camera, rows = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)), np.arange(200)
+    points = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 8), (200, 3))
+    index = MapIndex.build(points, ("a",), np.zeros(200, np.int32), rows, rows)
+    truth = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.2, -0.1, 0.4))
+    side = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    given = replace(side, translation=(0.1 + error_m, 0.0, 0.0))
+    sources = []
+    for name, count, pose in (("front", 200, truth), ("side", 150, side @ truth)):
+        seen_px = project(camera, pose, points).astype(np.float32)
+        pairs = [("a", np.stack([rows[:count]] * 2, axis=1), np.full(count, 0.9))]
+        typed = TypedMatches(index, seen_px, pairs)
+        of_rig = RigidTransform.identity() if name == "front" else given
+        sources.append(StoredSource(QueryView(name, camera, (typed,), of_rig), ["a"]))
+    results = localize_query(
+        sources,
+        LocalizationOptions(min_confidence=0.0),
+        frame_of=lambda _: "",
+        centers={"a": np.zeros(3)},
+        ranker=load_plugin(POSE_RANKERS, "inliers"),
+        scene=cast(RankingScene, None),
+    )
+    for result, pose in zip(results, (truth, side @ truth), strict=True):
+        assert isinstance(result, Pose) and movement(pose, result.cam_from_world)[0] < 1e-3
+        assert ("joint localization" in " ".join(result.remarks)) == (error_m > 0)
+
+
 def test_localized_queries_are_written_as_kapture_and_tables(world: Any, tmp_path: Path) -> None:
     results = world.localized()
     write_localized(tmp_path, world.query(), results, timing=tmp_path / "timing.csv")
