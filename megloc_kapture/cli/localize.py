@@ -110,6 +110,8 @@ class Localize(ReadingMap, Deciding, Common):
         focal = {remark for remark in remarks if "focal length" in remark}
         for remark in sorted(remarks.keys() - focal):
             self.say(f"skipped for {remarks[remark]} queries: {remark}")
+        if not options.localization.rigs and len(queries.units(rigs=True)) < len(queries.names):
+            self.say("rigs: each camera alone; --set localization.rigs=true localizes them jointly")
         if kapture_map.unit != METRES:
             self.say("positions are in units of the map, of unknown scale")
         if misfits := misfits_text(results.values(), STATUS_FILE):

@@ -19,9 +19,9 @@ from megloc_kapture.cli.common import cameras_of_text
 from megloc_kapture.cli.main import main
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.images import image_size, write_image
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs, write_sensors
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.values import Camera
+from megloc_kapture.values import Camera, RigidTransform
 from tests.cli.foreign import DESCRIPTORS, FOREIGN_MAPS, KEYPOINTS, rename_type
 from tests.worlds import folder_bytes
 
@@ -108,6 +108,19 @@ def test_given_pairs_replace_retrieval(megloc: Any, foreign: Path) -> None:
         write_pairs(foreign / "pairs.txt", [ImagePair(first, second, 1.0)])
         done = megloc(*localize(foreign, foreign / "none"), "--pairs", foreign / "pairs.txt")
         assert done.status == 2 and "pairs.txt: no row names both a query and" in done.err
+
+
+def test_rigs_that_are_not_localized_jointly_are_mentioned(megloc: Any, foreign: Path) -> None:
+    data = KaptureFolder(foreign / "query").read()
+    (sensor,) = data.sensors.values()
+    cameras = [f"camera{number}" for number in range(4)]
+    data.sensors = dict.fromkeys(cameras, sensor)
+    data.rigs = {"rig": dict.fromkeys(cameras, RigidTransform.identity())}
+    records = zip(cameras, data.image_names(), strict=True)
+    data.records_camera = {(1, camera): image for camera, image in records}
+    write_sensors(foreign / "query", data)
+    done = megloc(*localize(foreign, foreign / "localized"), "--set", "query_pairs.top_k=1")
+    assert "--set localization.rigs=true localizes them jointly" in done.err
 
 
 def test_without_shared_global_features_candidates_come_from_vlad(
