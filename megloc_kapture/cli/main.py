@@ -56,6 +56,7 @@ COMMANDS = {
     "options": "info:OptionsCommand",
     "doctor": "weights:Doctor",
 }
+_RESUMING = ("eval", "map", "train", "train-field")  # the others start over
 
 
 def _help_texts() -> dict[str, str]:
@@ -108,8 +109,10 @@ def _parser(given: Sequence[str]) -> Any:
     return functools.reduce(operator.or_, commands)
 
 
-def _say_stopped(how: str) -> None:
-    print(f"megloc: {how}; run the same command again to resume", file=sys.stderr)
+def _say_stopped(how: str, given: Sequence[str]) -> None:
+    resumes = given[:1] and given[0] in _RESUMING
+    remedy = "; run the same command again to resume" if resumes else ""
+    print(f"megloc: {how}{remedy}", file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -144,12 +147,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         status = command.run() or DONE
         sys.stdout.flush()
     except KeyboardInterrupt:
-        _say_stopped("interrupted")
+        _say_stopped("interrupted", given)
         status = INTERRUPTED
     except SystemExit as end:
         # not printed by the signal handler, which may have interrupted another print
         if end.code == TERMINATED:
-            _say_stopped("terminated")
+            _say_stopped("terminated", given)
         raise
     except Exception as error:
         status = _tell(error, debug)
