@@ -220,7 +220,7 @@ class Service:
     async def _image_in(self, request: Request) -> tuple[bytes, str | None]:
         body = await self._read_body(request)
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        if kind in ("image/jpeg", "image/png", "application/octet-stream", ""):
+        if kind.startswith("image/") or kind in ("application/octet-stream", ""):
             return body, None
         if kind != "multipart/form-data":
             raise HTTPException(
@@ -233,14 +233,16 @@ class Service:
         async def receive() -> dict[str, Any]:
             return {"type": "http.request", "body": body}
 
-        form = await Request(request.scope, receive).form(max_files=1, max_fields=4)
+        form = await Request(request.scope, receive).form(max_files=4, max_fields=4)
         image, camera = form.get("image"), form.get("camera")
+        if isinstance(camera, UploadFile):
+            camera = (await camera.read()).decode(errors="replace")
         if (
             not isinstance(image, UploadFile)
-            or isinstance(camera, UploadFile)
             or set(form) - {"image", "camera"}
+            or len(form.multi_items()) > len(form)
         ):
-            raise HTTPException(422, "a form has a file `image`, and may have a text `camera`")
+            raise HTTPException(422, "a form has one file `image`, and may have one `camera`")
         return await image.read(), camera
 
     async def _read_body(self, request: Request) -> bytes:

@@ -78,9 +78,11 @@ def test_answers_equal_the_localizer(
     in_the_address = client.post(
         f"/localize?camera={quote(photo.camera_json())}",
         content=photo.content,
-        headers={"content-type": "image/jpeg"},
+        headers={"content-type": "image/jpg"},  # not registered, but common
     )
     assert in_the_address.content == answer.content
+    files = {"image": photo.content, "camera": photo.camera_json().encode()}  # curl -F camera=@FILE
+    assert client.post("/localize", files=files).content == answer.content
     # the documentation describes this answer
     api = client.get("/openapi.json").json()
     call = api["paths"]["/localize"]["post"]
@@ -191,6 +193,11 @@ def test_other_content_types_are_refused(client: TestClient, photos: list[Photo]
     for kind in ("application/json", "application/x-www-form-urlencoded"):
         answer = client.post("/localize", content=photos[0].content, headers={"content-type": kind})
         refused(answer, 415, f"Content-Type says {kind}: send image/jpeg")
+
+
+def test_two_images_are_refused(client: TestClient, photos: list[Photo]) -> None:
+    files = [("image", photo.content) for photo in photos[:2]]
+    refused(client.post("/localize", files=files), 422, "a form has one file `image`")
 
 
 def test_large_requests_are_refused(localizer: Localizer) -> None:
