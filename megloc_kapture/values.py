@@ -34,6 +34,10 @@ ONE_FOCAL_MODELS = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
 
+# a shorter focal length, relative to the larger side of the image, is not in pixels; that of a lens
+# of 220 degrees is 0.13
+_SHORTEST = 0.02
+
 # `megloc localize`, `Localizer` and `megloc serve` reject poses with a lower confidence;
 # benchmarks keep every pose
 MIN_CONFIDENCE = 0.6
@@ -139,11 +143,16 @@ class Camera:
 
 
 def check_camera(camera: Any) -> None:
-    """Raise DataError for anything but a :class:`Camera`, such as a matrix K."""
+    """Raise DataError for anything but a :class:`Camera` in pixels, such as a matrix K."""
     if not isinstance(camera, Camera):
         raise DataError(
             "a camera must be a megloc_kapture.Camera (Camera.from_colmap converts pycolmap's), "
             f"got {type(camera)}"
+        )
+    if camera.params[0] < _SHORTEST * max(camera.width, camera.height):
+        raise DataError(
+            f"focal length {camera.params[0]:g} of a {camera.width}x{camera.height} image: give "
+            "pixels, not millimetres or fractions of the image's size"
         )
 
 

@@ -156,6 +156,7 @@ class KaptureQueries(Queries):
                 if self._is_unknown(name):
                     read_photo(self._folder.image_path(name))
                 else:
+                    check_camera(self._data.camera_of(name))
                     check_image_size(self._folder.image_path(name), self._data.camera_of(name))
             except DataError as error:
                 self.unreadable[name] = error.message
