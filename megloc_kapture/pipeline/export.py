@@ -61,6 +61,7 @@ _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
     "OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2")),
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
+_UNDISTORT = "nerfstudio can read the output of `megloc export colmap --undistort`"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,7 +130,14 @@ def export_nerfstudio(
                 "transform_matrix": (world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
             }
         )
-    content: dict[str, Any] = {"frames": frames}
+    # nerfstudio reads the model of all cameras here, and takes frames without it for perspective
+    models = sorted({_nerfstudio_model(image.camera)[0] for image in images})
+    require(
+        len(models) < 2,
+        f"nerfstudio takes cameras of one model, and these are {' and '.join(models)}: choose one "
+        f"with --sensor, or undistort: {_UNDISTORT}",
+    )
+    content: dict[str, Any] = {"camera_model": models[0], "frames": frames}
     if len(points):
         write_ply(output / "sparse_pc.ply", points[:, :3], points[:, 3:])
         content["ply_file_path"] = "sparse_pc.ply"
@@ -201,18 +209,20 @@ def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDA
     return cam_from_world.inverse().apply(rays)
 
 
-def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
+def _nerfstudio_model(camera: Camera) -> tuple[str, tuple[str, ...]]:
     require(
         camera.model in _NERFSTUDIO,
-        f"nerfstudio has no camera model {camera.model}; undistort first: nerfstudio can read the "
-        "output of `megloc export colmap --undistort`",
+        f"nerfstudio has no camera model {camera.model}; undistort first: {_UNDISTORT}",
     )
-    model, names = _NERFSTUDIO[camera.model]
+    return _NERFSTUDIO[camera.model]
+
+
+def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
+    _, names = _nerfstudio_model(camera)
     cx, cy = principal_point_px(camera)
     fx, fy = camera.params[0], camera.params[0 if camera.model in ONE_FOCAL_MODELS else 1]
     distortion = camera.params[len(camera.params) - len(names) :]
     return {
-        "camera_model": model,
         "w": camera.width,
         "h": camera.height,
         "fl_x": fx,

@@ -69,18 +69,27 @@ def test_cameras_of_nerfstudio_project_like_opencv(camera: Camera, tmp_path: Pat
     (tmp_path / "a.jpg").touch()
     posed = image(camera, RigidTransform.identity(), path=tmp_path / "a.jpg")
     export_nerfstudio([posed], NO_POINTS, tmp_path)
-    frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    (frame,) = content["frames"]
     matrix = np.array(
         [[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1.0]]
     )
     points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (20, 3))
-    fisheye = frame["camera_model"] == "OPENCV_FISHEYE"
+    fisheye = content["camera_model"] == "OPENCV_FISHEYE"  # where nerfstudio reads it
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
     distortion = np.array([frame.get(name, 0.0) for name in names])
     zero, projection = np.zeros(3), cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
     pixels, _ = projection(points[:, None], zero, zero, matrix, distortion)
     expected = project(camera, RigidTransform.identity(), points)
     np.testing.assert_allclose(pixels.reshape(-1, 2), expected, atol=1e-8)
+
+
+def test_nerfstudio_takes_no_fisheye_with_other_cameras(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    cameras = Camera.pinhole(6, 4, 5), Camera("OPENCV_FISHEYE", 6, 4, (5, 5, 3, 2, 0, 0, 0, 0))
+    images = [image(c, RigidTransform.identity(), path=tmp_path / "a.jpg") for c in cameras]
+    with pytest.raises(DataError, match="OPENCV and OPENCV_FISHEYE: choose one with --sensor"):
+        export_nerfstudio(images, NO_POINTS, tmp_path)
 
 
 def test_tum_timestamps_are_seconds_or_frame_numbers(tmp_path: Path) -> None:
