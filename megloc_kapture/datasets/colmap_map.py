@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import cameras_of_images, is_kapture, warn_of_scaled
-from megloc_kapture.datasets.reference_map import ColmapDatabase, write_reference_map
+from megloc_kapture.datasets.reference_map import UNDEFINED, ColmapDatabase, write_reference_map
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import (
     BINARY_FILES,
@@ -202,18 +202,19 @@ class ColmapReconstruction:
             with ColmapDatabase(source.database) as opened:
                 feature_type = opened.feature_type()
                 local_type = None if feature_type is None else feature_type[0]
-        require(
-            local_type is not None or source.images is not None,
-            "there are no descriptors to match queries with: give `megloc import colmap` the "
-            "database of the model (--database), or images to extract them from (--images)",
-            path=source.model,
-        )
         if not len(self.model.points.image_ids):
             what = "points without tracks" if len(self.model.points) else "no points"
             hint = "give `megloc import colmap` the images to make them from (--images)"
             require(source.images, f"the model has {what}; {hint}", path=source.model)
             _log.warning(_MAPPED_AGAIN, source.model, f"the model has {what}")
             return None
+        if local_type is None and source.images is None:
+            _log.warning(
+                "%s has no descriptors or images: it can be viewed and exported; to localize in "
+                "it, `megloc import colmap` needs its database (--database) or images (--images)",
+                source.model,
+            )
+            return self._write_reference(output, keypoints_type=UNDEFINED)
         if local_type is None:
             return self._write_with_sift(output, work)
         try:

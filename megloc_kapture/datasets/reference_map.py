@@ -32,8 +32,9 @@ from megloc_kapture.io.kapture import (
 # feature type of COLMAP's feature/types.h -> name of the extractor or weights in this package, and
 # dtype; COLMAP stores all descriptors as bytes, but those of networks are float32
 _SIFT, _UNDEFINED = 0, -1
+UNDEFINED = "colmap-undefined"  # type of features of unknown origin
 _TYPES = {
-    _UNDEFINED: ("colmap-undefined", "u1"),
+    _UNDEFINED: (UNDEFINED, "u1"),
     _SIFT: ("sift", "u1"),
     1: ("aliked-n16rot", "<f4"),
     2: ("aliked-n32", "<f4"),

@@ -106,7 +106,8 @@ class LocalType:
             raise DataError(
                 f"features of type {self.name!r} are missing and no extractor for them is "
                 f"installed (known: {', '.join(plugin_names(LOCAL_FEATURES))}); give them with "
-                "--features-dir, or in the kapture folder; or, if a known extractor made "
+                "--features-dir, in the kapture folder, or for a COLMAP model by `megloc import "
+                "colmap` with --database or --images; or, if a known extractor made "
                 f"them, write its name first in {self.name}/keypoints.txt",
                 path=self._map.folder.root,
             )

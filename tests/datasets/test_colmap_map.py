@@ -26,9 +26,11 @@ from megloc_kapture.datasets.colmap_map import (
 from megloc_kapture.datasets.reference_map import ColmapDatabase, write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.io.colmap_model import SparsePoints
+from megloc_kapture.io.colmap_model import SparsePoints, read_colmap_model
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
+from megloc_kapture.pipeline.export import export
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.values import Camera, RigidTransform
 from tests.worlds import one_camera
 
@@ -245,10 +247,22 @@ def test_ambiguous_and_missing_models_are_refused(room: Path) -> None:
             find_colmap(path, **given)
 
 
-def test_without_features_or_images_the_import_is_refused(room: Path, tmp_path: Path) -> None:
+def test_a_model_without_descriptors_and_images_can_be_viewed_and_exported(
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = ColmapFolders(find_colmap(room).model, None, None)
+    folder, counts = imported(source, tmp_path / "map")
+    model = read_colmap_model(source.model)
+    assert counts["observations"] == len(model.points.image_ids) > 0
+    np.testing.assert_array_equal(folder.points3d()[:, :3], model.points.xyz)
+    assert "viewed and exported; to localize in it, `megloc" in caplog.text
+    assert export("ply", tmp_path / "scene.ply", map=folder.root) == len(model.images)
+    with pytest.raises(DataError, match="lack descriptors: .*colmap. with --database or --images"):
+        Localizer(KaptureMap.open(folder.root))
+
+
+def test_without_images_that_are_needed_the_import_is_refused(room: Path, tmp_path: Path) -> None:
     source, output = replace(find_colmap(room), database=None), tmp_path / "map"
-    with pytest.raises(DataError, match="no descriptors .*--database.* or images .*--images"):
-        import_colmap(ColmapFolders(source.model, None, None), output)
     (room / "images" / "0003.jpg").rename(room / "images" / "0003.png")
     message = r"images: 1 of the model's 7 images are not here, .* 0003.jpg \(but 0003.png is\)"
     with pytest.raises(DataError, match=message):
