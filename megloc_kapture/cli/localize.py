@@ -22,7 +22,7 @@ from megloc_kapture.cli.common import (
     ReadingMap,
     cameras_of_text,
 )
-from megloc_kapture.errors import OptionError, check_option, require
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
@@ -76,6 +76,9 @@ class Localize(ReadingMap, Deciding, Common):
         folder: KaptureFolder | Photographs
         if self.query is None:
             folder = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
+            if not folder.names:
+                name, reason = min(folder.unreadable.items())
+                raise DataError(f"no photograph can be used, the first is {name}: {reason}")
         else:
             folder = self.kapture(self.query)
         kapture_map = _consistent_map(self, self.input)

@@ -142,6 +142,10 @@ def test_without_any_usable_image_the_command_stops(
         image.write_bytes(b"")
     command = ("localize", "-i", finished / "map", "--query", dataset / "query", "-o")
     megloc(*command, tmp_path / "localized").refused(r"records_data/0001\.jpg: not an image")
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"")
+    command = ("localize", "-i", finished / "map", "--images", tmp_path / "phone")
+    megloc(*command).refused(r"no photograph can be used, the first is IMG_1\.HEIC: \.HEIC cannot")
 
 
 def test_without_any_localized_query_a_warning_is_printed_and_a_fallback_marked(
