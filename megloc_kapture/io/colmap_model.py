@@ -38,6 +38,7 @@ BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 IMAGE_COLUMNS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 # an image size in cameras.txt, written as float by scripts: 1920.0 1080.0
 _SIZE = re.compile(r"^(\s*\d+\s+\w+\s+\d+)\.0*(\s+\d+)\.0*(?=\s)", re.MULTILINE)
+_NO_ID = 2**32 - 1  # COLMAP's value for a missing id
 _RIG_FILES = ("rigs", "frames")  # since COLMAP 3.12
 # models that kapture lacks: an equivalent with distortion, and the number of zeros to append
 _SAME_AS = {"SIMPLE_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", 1), "FISHEYE": ("OPENCV_FISHEYE", 4)}
@@ -229,10 +230,14 @@ def _images_for_pycolmap(path: Path, cameras: Path) -> tuple[str, dict[int, str]
         with named(path, number):
             require(len(row) == 10, f"{len(row)} columns instead of 10 ({IMAGE_COLUMNS})")
             image_id = int(numbers_of(row[:9], IMAGE_COLUMNS.removesuffix(" NAME"))[0])
+            require(
+                0 <= image_id < _NO_ID,
+                f"image id {row[0]} is not from 0 to {_NO_ID - 1}; number the images instead",
+            )
             require(image_id not in names, f"image id {image_id} is listed twice")
             require(row[8] in camera_ids, f"camera {row[8]} is not in {cameras.name}")
         names[image_id] = row[9]
-        lines.append(f"{' '.join(row[:9])} {image_id}\n{features}\n")
+        lines.append(f"{image_id} {' '.join(row[1:9])} {image_id}\n{features}\n")
     return "".join(lines), names
 
 

@@ -238,6 +238,7 @@ IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n\n8 1 0 0 0 0 0 0 1 db/8.jpg\n\n"
         ("cameras", " -0.0811", "", "cameras.txt:1: camera model SIMPLE_RADIAL takes 4 parameters"),
         ("images", "0 0 1 db/8", "0 0 3 db/8", "images.txt:3: camera 3 is not in cameras.txt"),
         ("images", "8 1", "7 1", "images.txt:3: image id 7 is listed twice"),
+        ("images", "8 1", f"{10**18} 1", r"images.txt:3: image id 1000.* is not from 0 to 42949"),
         ("images", "7 1 0", "7 nan 0", "images.txt:1: expected finite numbers IMAGE_ID QW"),
         ("images", "2 1 db/7.jpg", "2 1", "images.txt:1: 9 columns instead of 10"),
         ("cameras", "1600", "0", "cameras.txt: camera 1: image size 0x1067"),
@@ -280,11 +281,13 @@ def test_images_of_other_tools_are_read(tmp_path: Path, change: Callable[[str], 
     assert len({name.rpartition("/")[0] for name in names} & {"db", "my photos/day 1"}) == 1
 
 
-def test_image_sizes_written_as_floats_are_read(tmp_path: Path) -> None:
-    cameras = CAMERAS.replace("1600 1067", "1600.0 1067.")
-    for file, text in (("cameras", cameras), ("images", IMAGES), ("points3D", "")):
+def test_image_sizes_and_ids_written_as_floats_are_read(tmp_path: Path) -> None:
+    cameras, images = CAMERAS.replace("1600 1067", "1600.0 1067."), IMAGES.replace("7 1", "7.0 1")
+    for file, text in (("cameras", cameras), ("images", images), ("points3D", "")):
         (tmp_path / f"{file}.txt").write_text(text)
-    (camera,) = read_colmap_model(tmp_path).cameras.values()
+    model = read_colmap_model(tmp_path)
+    assert [image.image_id for image in model.images] == [7, 8]
+    (camera,) = model.cameras.values()
     assert (camera.width, camera.height, camera.params[0]) == (1600, 1067, 1084.6)
 
 
