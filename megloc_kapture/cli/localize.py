@@ -84,7 +84,8 @@ class Localize(ReadingMap, Deciding, Common):
         kapture_map = _consistent_map(self, self.input)
         candidates = None if self.pairs is None else candidates_of(read_pairs(self.pairs))
         # fail before the first query and before anything is written
-        localizer = Localizer(kapture_map, options=self.options())
+        options = self.options()
+        localizer = Localizer(kapture_map, options=options)
         results = Results(
             localizer, folder, workers=workers, candidates=candidates, track=self.track
         )

@@ -244,9 +244,8 @@ def run_plan(
         made = workspace.manifest(stage.name)
         planned = _planned(stage, inputs)
         why = asked.get(stage.name) or _why(stage, planned, made, workspace)
-        why = "" if number < start else why
         state: State
-        if made is not None and not why:
+        if made is not None and (number < start or not why):
             state, manifest = "skipped" if number < start else "kept", made
         elif dry_run:
             stage.check()
@@ -407,7 +406,7 @@ def describe(report: StageReport) -> str:
     if report.state == "kept":
         return f"{report.name}: up to date"
     if report.state == "skipped":
-        return f"{report.name}: used as is"
+        return f"{report.name}: used as is" + (f" ({report.why})" if report.why else "")
     if report.state == "pending":
         return f"{report.name}: would run ({report.why})"
     parts = filter(None, (counts_text(report.counts), f"{report.seconds:.1f} s"))

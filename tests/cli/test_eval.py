@@ -168,9 +168,12 @@ def test_from_uses_files_of_another_tool_as_they_are(
     nearest = {pair.query: pair.map for pair in reversed(pairs)}
     rows = [f"{query}, {image}, 1.0\n" for query, image in sorted(nearest.items())]
     (workspace / "pairs" / "query.txt").write_text("".join(rows))
-    done = evaluate(scene, workspace, "--from", "query_matches", "--until", "localization")
+    again = ("--from", "query_matches", "--until", "localization")
+    done = evaluate(scene, workspace, *again, "--set", "query_pairs.top_k=1")
     assert ran(done.err) == list(STAGES[7:9])
-    assert set(map(states(done.err).get, STAGES[:6])) == {"used as is"}
+    used = states(done.err)
+    assert set(map(used.get, STAGES[:6])) == {"used as is"}
+    assert used["query_pairs"] == "used as is (options changed: query_pairs.top_k)"
     statuses = read_status(workspace / "localized" / "status.csv")
     candidates = {query: (image,) for query, image in nearest.items()}
     assert {query: status.candidates for query, status in statuses.items()} == candidates
