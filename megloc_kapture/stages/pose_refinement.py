@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import threading
 import time
@@ -228,16 +229,17 @@ def apply_refiners(
             refined = PoseRefinement(before, reason)
         else:
             refined = refiner.refine(image, camera, before, references, scene)
+        who = f"plugin {refiner.name!r} on image {image}"
         if not isinstance(refined, PoseRefinement):
             raise PluginError(
-                f"plugin {refiner.name!r} on image {image}: refine returned "
-                f"{type(refined).__name__}, not PoseRefinement"
+                f"{who}: refine returned {type(refined).__name__}, not PoseRefinement"
             )
         after = before
         if refined.accepted:
             after = refined.cam_from_world
-            w, x, y, z = map(float, after.quat_wxyz)
-            t_x, t_y, t_z = map(float, after.translation)
+            w, x, y, z, t_x, t_y, t_z = map(float, (*after.quat_wxyz, *after.translation))
+            if not abs(math.hypot(w, x, y, z) - 1) < 1e-3 or not math.isfinite(t_x + t_y + t_z):
+                raise PluginError(f"{who}: no rotation and position: {after}")
             after = RigidTransform((w, x, y, z), (t_x, t_y, t_z))
             pose = replace(pose, cam_from_world=after, covariance=refined.covariance)
         moved_m, turned_deg = movement(before, after)

@@ -265,6 +265,10 @@ class Shift:
         assert scene.query_image(query).shape[:2] == (camera.height, camera.width)
         if self.name == "wrong":
             return None
+        if self.name == "nan":
+            return PoseRefinement(RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, np.nan, 0.0)))
+        if self.name == "long":
+            return PoseRefinement(RigidTransform((1.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
         if query == self.stays:
             return PoseRefinement(cam_from_world, "nothing overlaps", {"overlap": 0.125})
         return PoseRefinement(SHIFT @ cam_from_world, measures={"overlap": 0.5})
@@ -374,6 +378,12 @@ def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_pa
     wrong = Chosen(refiners=(Shift(name="wrong"),))
     with pytest.raises(PluginError, match="'wrong' on image .*: refine returned NoneType"):
         refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
+    for name in ("nan", "long"):
+        wrong = Chosen(refiners=(Shift(name=name),))
+        with pytest.raises(
+            PluginError, match=f"'{name}' on image .*: no rotation and position: Rig"
+        ):
+            refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
 
 
 @pytest.fixture
