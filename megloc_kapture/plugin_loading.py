@@ -85,7 +85,8 @@ def checked_array(
                 raise PluginError(f"{who}: values that are not finite")
             return array
         actual = f"{array.dtype} {array.shape}"
-    wanted = ", ".join("N" if length is None else str(length) for length in shape)
+    free = iter("ND")
+    wanted = ", ".join(next(free) if length is None else str(length) for length in shape)
     raise PluginError(f"{who}: got {actual}, expected {' or '.join(dtypes)} ({wanted})")
 
 

@@ -184,6 +184,8 @@ def test_a_second_package_may_not_mix_up_names_and_groups(
 def test_arrays_of_plugins_are_checked(array: Any, message: str) -> None:
     with pytest.raises(PluginError, match=message):
         checked_array("plugin x", array, (None, 2), "float32", "uint8")
+    with pytest.raises(PluginError, match=r"expected uint8 \(N, D\)"):
+        checked_array("plugin x", np.ones(2), (None, None), "uint8")
     whole = np.ones((3, 2), np.uint8)
     assert checked_array("plugin x", whole, (None, 2), "float32", "uint8") is whole
 

@@ -70,7 +70,7 @@ def in_batches(
         most = min(most_at_once(plugin, many), _limits.get(key, sys.maxsize))
         batch = items[len(finished) :][:most]
         try:
-            results = run(batch)
+            results = list(run(batch))
         except Exception as error:  # plugins may raise anything
             if not is_out_of_memory(error):
                 error.add_note(f"{key[0]} failed on {name(len(finished))}")

@@ -162,6 +162,9 @@ def test_other_errors_are_not_retried(eight_at_once: None) -> None:
         batched(Limited(9), broken)
     with pytest.raises(PluginError, match="match_many of Limited returned 0 results for 5 items"):
         batched(Limited(9), lambda _: [])
+    with pytest.raises(TypeError, match="not iterable") as failure:  # not of the caller's code
+        batched(Limited(9), lambda _: 5)
+    assert failure.value.__notes__ == ["Limited failed on 0"]
 
 
 class ManySift(RootSift):
