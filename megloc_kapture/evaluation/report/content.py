@@ -109,6 +109,12 @@ def notes(evaluation: Evaluation) -> list[str]:
             f"{lack} no pose in the result: {_first(absent)}; if these are map images, give true "
             "poses of the queries alone"
         )
+    if equal := [q.name for q in evaluation.queries if q.truth and q.truth == q.cam_from_world]:
+        have = counted(len(equal), "pose equals", "poses equal")
+        sentences.append(
+            f"{have} the true pose to the last digit: {_first(equal)}; if these are map images, "
+            "give true poses of the queries alone"
+        )
     missing = evaluation.without_truth
     if missing:
         lack = counted(

@@ -214,5 +214,7 @@ def test_text_without_poses_and_without_angles() -> None:
         assert words in text
     assert "1000 images have no true pose" in text and "x5.jpg" not in text
     metres = [Threshold(position_m=0.1)]
+    assert "equal" not in text
     text = report_text(evaluate_poses({"a": HERE}, {"a": HERE}, thresholds=metres))
     assert "recall (%) at 0.1 m\nPosition error at or below" in text
+    assert "1 pose equals the true pose to the last digit: a; if these are map images" in text
