@@ -93,7 +93,8 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
 
     Rows with a number that is not finite or with a zero quaternion, which other tools write for
     failed queries, are left out with a warning. Tabs, commas, CRLF, backslashes in names, empty
-    lines, comments and a header that names the columns are accepted.
+    lines, comments, a header that names the columns, and up to three columns after the pose are
+    accepted: pseudo ground truth of 7-Scenes has a focal length there, ACE errors and inliers.
     """
     text = read_text(path)
     if text.startswith("# kapture format"):
@@ -106,15 +107,15 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     for number, fields in rows:
         with named(path, number):
             require(
-                len(fields) == 8,
+                8 <= len(fields) <= 11,
                 f"{len(fields)} columns instead of 8 ({COLUMNS}); write such rows of "
                 "cam_from_world if this is another form (KITTI, 7-Scenes, Cambridge Landmarks)",
             )
             name = fields[0].replace("\\", "/")
             require(name not in poses, f"{name!r} is given twice")
-            values = [parse_number(field) for field in fields[1:]]
+            values = [parse_number(field) for field in fields[1:8]]
             failed = not np.isfinite(values).all() or not any(values[:4])
-            poses[name] = None if failed else parse_pose(fields[1:], "ltvl", repr(name))
+            poses[name] = None if failed else parse_pose(fields[1:8], "ltvl", repr(name))
     if failures := [name for name, pose in poses.items() if pose is None]:
         message = "%s: %d rows of nan or zeros are read as queries without a pose, such as %s"
         _log.warning(message, path, len(failures), failures[0])
@@ -135,22 +136,26 @@ def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 def _fields(line: str) -> list[str]:
     """Split a row at blanks, or at commas or semicolons, as spreadsheets write it."""
-    for separator in ",;":
+    for separator in ";,":
         fields = [field.strip(' \t\r"') for field in line.split(separator)]
-        if len(fields) >= 8 and not any(" " in field for field in fields[1:]):
+        if len(fields) >= 8 and not any(len(field.split()) > 1 for field in fields[1:]):
             return fields
     return line.split()
 
 
 def _in_column_order(rows: Iterable[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
-    """Choose the columns that a header names, as in ``poses.csv``; without one, keep all."""
+    """Choose the columns that a header names, as in ``poses.csv``; without one, keep all.
+
+    The first title is that of the names: pandas writes an index without a title before them.
+    """
     header: list[str] = []
     for number, fields in rows:
         names = [field.lower().replace("_", "") for field in fields]
         if set(COLUMNS.split()[1:]) <= set(names):
             header = names
         elif len(fields) == len(header):
-            yield number, [fields[0], *(fields[header.index(c)] for c in COLUMNS.split()[1:])]
+            titles = (next(filter(None, header)), *COLUMNS.split()[1:])
+            yield number, [fields[header.index(title)] for title in titles]
         else:
             yield number, fields
 
