@@ -43,10 +43,11 @@ from megloc_kapture.datasets.robotcar.images import (
     with_images,
     with_rig_of_model,
 )
-from megloc_kapture.errors import check_option
+from megloc_kapture.errors import check_option, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
+from megloc_kapture.io.files import find_near
 from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Options
 
@@ -141,7 +142,13 @@ class RobotCar:
         layout = Layout(root)
         version = options.version
         if version == "auto":
-            version = 2 if layout.test_list.is_file() else 1
+            found = next(find_near(layout.root, layout.test_list.name), None)
+            require(
+                found in (None, layout.test_list),
+                "a list of version 2, which belongs in the root; version=1 imports version 1",
+                path=found,
+            )
+            version = 1 if found is None else 2
         self._check_version(version)
         queries = read_queries(layout, version, missing, allow_missing=allow_missing)
         wanted = sorted({name for listed in queries.locations.values() for name in listed})
