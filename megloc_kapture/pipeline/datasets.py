@@ -128,6 +128,11 @@ class DatasetChoice:
         if self.name.startswith(TWIN_PREFIX):
             bare = [replace(count, published=None) for count in dataset.summary]
             dataset = replace(dataset, summary=bare)
+        others = [count for count in dataset.summary if count.published not in (None, count.found)]
+        if others:
+            shown = ", ".join(f"{c.found} {c.what.strip()} ({c.published})" for c in others[:3])
+            message = "%d counts differ from the published ones: %s; %s has all"
+            _log.warning(message, len(others), shown, SUMMARY_FILE)
         write_bytes(output / SUMMARY_FILE, summary_text(dataset).encode())
         truth = dataset.query_gt
         return {

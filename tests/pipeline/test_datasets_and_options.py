@@ -97,7 +97,9 @@ def test_without_megloc_twins_the_message_has_the_remedy(
         assert choose_dataset(name, tmp_path).twin is None
 
 
-def test_an_import_writes_a_summary_and_the_protocol(tmp_path: Path) -> None:
+def test_an_import_writes_a_summary_and_the_protocol(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     root, out = tmp_path / "root", tmp_path / "out"
     choice = choose_dataset("aachen", root)
     with pytest.raises(DataError, match="root: no such folder"):
@@ -111,6 +113,11 @@ def test_an_import_writes_a_summary_and_the_protocol(tmp_path: Path) -> None:
     assert read_side_tables(out / "megloc").protocol.dataset == "aachen"
     text = (out / SUMMARY_FILE).read_text()
     assert "published: 824, -821" in text and NIGHT[0] in text
+    assert "3 counts differ from the published ones: 3 database images (4328), 3 day" in caplog.text
+    caplog.clear()
+    twin = replace(choice, name="synthetic-aachen", allow_missing=True)
+    twin.import_to(root, tmp_path / "twin")
+    assert not caplog.text
 
 
 FILES = sorted(Path(__file__).parents[2].glob("benchmarks/*.toml"))
