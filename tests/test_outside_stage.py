@@ -156,6 +156,12 @@ def test_what_cannot_be_planned_is_refused(scene: Path) -> None:
     ):
         planned(scene, {"count_keypoints": {"most": 1}})
     kind = sys.modules["keypoint_counts"].CountKeypoints
+    del kind.Options  # a stage needs none, and no counts
+    (stage,) = (s for s in planned(scene, {"count_keypoints": {}}) if isinstance(s, kind))
+    assert stage.settings() == {}
+    foreign = type("Foreign", (), {"name": "foreign"})
+    with pytest.raises(PluginError, match="'foreign' is not derived from megloc_kapture.stages.st"):
+        run_plan([foreign()], Workspace(scene.parent / "workspace"))
     kind.reads = ("depth_maps",)
     with pytest.raises(OptionError, match=r"count_keypoints reads depth_maps, which no stage"):
         planned(scene, {"count_keypoints": {}})

@@ -18,7 +18,14 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, suggestion
+from megloc_kapture.errors import (
+    DataError,
+    OptionError,
+    OutputError,
+    PluginError,
+    check_option,
+    suggestion,
+)
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.files import (
     clear_temporary,
@@ -230,6 +237,9 @@ def run_plan(
         if workspace.manifest(name) is None:
             raise OptionError(f"--from {first} needs stage {name}, which has not run; omit --from")
     for stage in stages:
+        if not isinstance(stage, Stage):
+            base = f"{Stage.__module__}.{Stage.__name__}"
+            raise PluginError(f"stage plugin {stage.name!r} is not derived from {base}")
         _check_root(stage, workspace)
     if not dry_run:
         # before any stage runs, so that the next run still repeats these stages if this one stops
@@ -377,7 +387,7 @@ def _run(
     clock = time.perf_counter()
     with workspace.staging(stage.name, planned.fingerprint, resumes=stage.resumes) as folder:
         resumed = replace(work, resume=stage.resumes, placement=stage.placement)
-        counted = stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder))
+        counted = stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder)) or {}
         # plugins may count with numpy
         counts = {n: int(v) if isinstance(v, Integral) else float(v) for n, v in counted.items()}
         clear_temporary(folder)

@@ -124,8 +124,8 @@ class Stage(ABC):
     reads: Sequence[str] = ()
     writes: Sequence[str] = ()
 
-    def __init__(self, options: Options) -> None:
-        self.options: Any = options
+    def __init__(self, options: Options | None = None) -> None:
+        self.options: Any = options or Options()
 
     def settings(self) -> dict[str, Any]:
         """Return settings that determine the output, as plain JSON values."""
