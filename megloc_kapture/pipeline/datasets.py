@@ -113,8 +113,14 @@ class DatasetChoice:
         if self.adapter is None:
             checked_folders(root, self.query_prefix)
         else:
-            dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
-            check_official(dataset, allow_missing=self.allow_missing)
+            check_official(self._read(root), allow_missing=self.allow_missing)
+
+    def _read(self, root: Path) -> OfficialDataset:
+        dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
+        if not isinstance(dataset, OfficialDataset):
+            what = f"returned {type(dataset).__name__}, not OfficialDataset"
+            raise PluginError(f"dataset plugin {self.name!r}: read {what}")
+        return dataset
 
     def import_to(self, root: Path, output: Path) -> dict[str, float]:
         """Import ``root`` into ``output`` and return counts for the log.
@@ -123,7 +129,7 @@ class DatasetChoice:
         """
         if self.adapter is None:
             return import_kapture_folders(root, output, query_prefix=self.query_prefix)
-        dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
+        dataset = self._read(root)
         write_official(dataset, output, allow_missing=self.allow_missing)
         if self.name.startswith(TWIN_PREFIX):
             bare = [replace(count, published=None) for count in dataset.summary]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import MeglocError, require
+from megloc_kapture.errors import MeglocError, PluginError, require
 from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.csv_table import write_records
 from megloc_kapture.io.dataset_tables import (
@@ -269,6 +269,9 @@ def _estimate(
         if not is_out_of_memory(error):
             raise
         return replace(row, reason="out of memory; make mvs.max_size_px smaller")
+    if not isinstance(estimate, DepthEstimate):
+        what = f"returned {type(estimate).__name__}, not DepthEstimate"
+        raise PluginError(f"estimator {type(estimator).__name__} on image {row.image}: {what}")
     file = _scratch_file(scratch, row.image)
     file.parent.mkdir(parents=True, exist_ok=True)
     np.savez(file, **vars(estimate))

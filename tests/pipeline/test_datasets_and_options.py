@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib.metadata import EntryPoints, entry_points
 from operator import attrgetter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -111,6 +112,9 @@ def test_an_import_writes_a_summary_and_the_protocol(
     counts = replace(choice, allow_missing=True).import_to(root, out)
     assert counts == {"map_images": 3, "queries": 3, "queries_with_truth": 0}
     assert read_side_tables(out / "megloc").protocol.dataset == "aachen"
+    foreign: Any = SimpleNamespace(read=lambda root, allow_missing: {})
+    with pytest.raises(PluginError, match="'aachen': read returned dict, not OfficialDataset"):
+        replace(choice, adapter=foreign).rehearse()
     text = (out / SUMMARY_FILE).read_text()
     assert "published: 824, -821" in text and NIGHT[0] in text
     assert "3 counts differ from the published ones: 3 database images (4328), 3 day" in caplog.text

@@ -18,7 +18,7 @@ import pytest
 from corner import CAMERA, depth_m
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import project, scaled_camera
 from megloc_kapture.io.csv_table import read_records
 from megloc_kapture.io.dataset_tables import ImageGroup, SideTables
@@ -38,6 +38,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.tables import DepthRow
 from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.mapping.uncertainty import point_covariances, point_deviations
+from megloc_kapture.mvs.sweep import Sweep
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
 from megloc_kapture.stages.map_refinement import MapRefinementOptions, refine_map
@@ -191,7 +192,7 @@ def test_images_with_depth_keep_it_and_missing_files_have_a_reason(
 
 
 def test_unsuitable_folders_are_refused(
-    world: Any, densified: KaptureFolder, tmp_path: Path
+    world: Any, densified: KaptureFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(DataError, match="no map to densify.*megloc triangulate"):
         densify_map(world.mapping(), tmp_path / "a", OPTIONS)
@@ -205,6 +206,9 @@ def test_unsuitable_folders_are_refused(
         densify_map(KaptureFolder(tmp_path / "blind"), tmp_path / "b", OPTIONS)
     with pytest.raises(DataError, match="no densified map"):
         fuse_depth(world.map(), tmp_path / "c.ply")
+    monkeypatch.setattr(Sweep, "estimate", lambda *_: None)
+    with pytest.raises(PluginError, match="Sweep on image .*: returned NoneType, not DepthEs"):
+        densify_map(world.map(), tmp_path / "d", OPTIONS)
 
 
 def test_triangulated_points_precede_lifted_ones(densified: KaptureFolder) -> None:
