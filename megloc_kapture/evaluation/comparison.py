@@ -127,7 +127,8 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
     first = evaluations[0]
     labels = [evaluation.label for evaluation in evaluations]
     if len(set(labels)) != len(labels):
-        raise OptionError(f"two results are called {max(labels, key=labels.count)!r}")
+        name = max(labels, key=labels.count)
+        raise OptionError(f"two results are called {name!r}; give each a label")
     for other in evaluations[1:]:
         both = f"{first.label} and {other.label} have different"
         check_option(first.thresholds == other.thresholds, f"{both} thresholds")

@@ -222,12 +222,13 @@ def checked_pose(
     translation: tuple[float, float, float],
     whose: str,
 ) -> RigidTransform:
+    # callers in Python may give arrays
+    numbers = [*np.ravel(quat_wxyz).tolist(), *np.ravel(translation).tolist()]
     # the squares of larger numbers may overflow
-    require(
-        all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)), f"{whose}: the pose is not finite"
-    )
+    require(all(abs(v) < 1e100 for v in numbers), f"{whose}: the pose is not finite")
+    qw, qx, qy, qz, tx, ty, tz = numbers
     with named(about=whose):
-        return RigidTransform(unit_quaternion(quat_wxyz), translation)
+        return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
 
 
 def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> RigidTransform:

@@ -214,6 +214,12 @@ def test_arguments_from_python(world: Any, tmp_path: Path) -> None:
     poses: dict[Any, Any] = {Path(name): world.truth[name] for name in names}
     row = evaluate({**poses, Path(first): None}, world.truth).row()
     assert (row.num_queries, row.num_localized) == (len(names), len(names) - 1)
+    single = np.float32  # as networks return them, in arrays
+    arrays: Any = {
+        n: RigidTransform(single(p.quat_wxyz), single(p.translation))
+        for n, p in world.truth.items()  # type: ignore[arg-type]
+    }
+    assert "equal" not in str(evaluate(arrays, world.truth))
     wrong: Any
     for wrong, message in (
         ({"thresholds": (0.1, 1)}, r"a list of \(metres, degrees\), got 0\.1"),
