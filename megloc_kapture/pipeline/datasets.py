@@ -113,10 +113,10 @@ class DatasetChoice:
         if self.adapter is None:
             checked_folders(root, self.query_prefix)
         else:
-            check_official(self._read(root), allow_missing=self.allow_missing)
+            check_official(self._read(self.adapter, root), allow_missing=self.allow_missing)
 
-    def _read(self, root: Path) -> OfficialDataset:
-        dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
+    def _read(self, adapter: DatasetAdapter, root: Path) -> OfficialDataset:
+        dataset = adapter.read(root, allow_missing=self.allow_missing)
         if not isinstance(dataset, OfficialDataset):
             what = f"returned {type(dataset).__name__}, not OfficialDataset"
             raise PluginError(f"dataset plugin {self.name!r}: read {what}")
@@ -129,7 +129,7 @@ class DatasetChoice:
         """
         if self.adapter is None:
             return import_kapture_folders(root, output, query_prefix=self.query_prefix)
-        dataset = self._read(root)
+        dataset = self._read(self.adapter, root)
         write_official(dataset, output, allow_missing=self.allow_missing)
         if self.name.startswith(TWIN_PREFIX):
             bare = [replace(count, published=None) for count in dataset.summary]
