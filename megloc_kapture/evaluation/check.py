@@ -39,11 +39,11 @@ _NAMES_SHOWN = 3
 
 # the server accepts names with .jpg and with .png for this dataset
 _ANY_ENDING = "robotcar"
-# dataset -> (names contain a folder, valid endings)
-_SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
-    "aachen": (False, (".jpg",)),
-    "inloc": (False, (".JPG",)),
-    "robotcar": (True, (".jpg", ".png")),
+# dataset -> (folders in names, valid endings)
+_SHAPES: dict[str, tuple[int, tuple[str, ...]]] = {
+    "aachen": (0, (".jpg",)),
+    "inloc": (0, (".JPG",)),
+    "robotcar": (1, (".jpg", ".png")),
 }
 
 # with fewer poses or cameras, any convention may fit by chance
@@ -332,10 +332,10 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
 def _check_shape(names: Iterable[str], dataset: str) -> list[Finding]:
     if dataset not in _SHAPES:
         return []
-    with_folder, endings = _SHAPES[dataset]
+    folders, endings = _SHAPES[dataset]
     names, findings = list(names), []
-    if shaped := [name for name in names if ("/" in name) != with_folder]:
-        what = "without the camera's folder (rear/...)" if with_folder else "with a folder"
+    if shaped := [name for name in names if name.count("/") != folders]:
+        what = "that differ from rear/TIMESTAMP" if folders else "with a folder"
         findings.append(_about("error", "name", shaped, "name", what))
     if others := [name for name in names if not name.endswith(endings)]:
         what = f"not ending in {' or '.join(endings)}"

@@ -192,6 +192,18 @@ def test_endings_and_cameras_of_robotcar(check: Check) -> None:
     assert (finding.severity, finding.kind, len(finding.names)) == ("note", "not-scored", 6)
 
 
+def test_names_are_checked_without_a_dataset(tmp_path: Path) -> None:
+    file = tmp_path / "poses.txt"
+    for name, dataset in (
+        ("1.jpg", "robotcar"),
+        ("dawn/rear/1.jpg", "robotcar"),
+        ("day/1.jpg", "aachen"),
+    ):
+        file.write_text(f"rear/2.jpg 1 0 0 0 0 0 0\n{name} 1 0 0 0 0 0 0\n")
+        finding = check_submission(file, dataset=dataset).findings[0]
+        assert (finding.severity, finding.kind) == ("error", "name") and name in finding.names
+
+
 def test_unknown_missing_and_double_names(check: Check) -> None:
     names = ["IMG_0.jpg", "else.jpg", "IMG_1.jpg", "query/day/IMG_1.jpg"]
     result = {finding.kind: finding for finding in named(check, names, AACHEN)}
