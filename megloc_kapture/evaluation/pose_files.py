@@ -106,8 +106,10 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     poses: dict[str, RigidTransform | None] = {}
     for number, fields in rows:
         with named(path, number):
+            # the second column of MLAD's rows is a timestamp
+            further = 8 < len(fields) <= 11 and not fields[1].isdecimal()
             require(
-                8 <= len(fields) <= 11,
+                len(fields) == 8 or further,
                 f"{len(fields)} columns instead of 8 ({COLUMNS}); write such rows of "
                 "cam_from_world if this is another form (KITTI, 7-Scenes, Cambridge Landmarks)",
             )
