@@ -244,7 +244,7 @@ def _broken_link(path: Path) -> str:
 
 
 def similar_name(path: Path) -> str:
-    """Return a remark on a missing file: a broken link, or a file with almost this name; or ""."""
+    """Return a remark on a missing file: a broken link, a folder, a similar name; or ""."""
     if broken := _broken_link(path):
         return broken
 
@@ -253,6 +253,8 @@ def similar_name(path: Path) -> str:
 
     with contextlib.suppress(OSError):
         for name in os.listdir(path.parent):
+            if name == path.name:
+                return "; it is a folder" if path.is_dir() else ""
             if plain(name) == plain(path.name):
                 return f"; {name!r} differs in case, or in how accents are encoded (macOS)"
     return ""

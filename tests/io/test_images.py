@@ -207,3 +207,5 @@ def test_a_name_in_other_capitals_or_accents_is_named(
     (tmp_path / stored).touch()
     with pytest.raises(DataError, match=f"no such image; '{stored}' differs in case"):
         read_image_rgb(tmp_path / asked)
+    with pytest.raises(DataError, match="no such image; it is a folder"):
+        read_image_rgb(tmp_path)
