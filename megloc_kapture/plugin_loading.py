@@ -102,6 +102,8 @@ def option_fault(error: ValidationError, model: type[Options]) -> str:
 
 def plugin_class(group: str, name: str) -> Any:
     """Return the class registered as ``name`` in ``group``; PluginError if it cannot be loaded."""
+    if not isinstance(name, str):
+        raise PluginError(f"a plugin is given by its registered name, got {name!r}")
     entries = [entry for entry in entry_points(group=group) if entry.name == name]
     if not entries:
         known = suggestion(name, plugin_names(group), listed="registered: ")

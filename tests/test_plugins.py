@@ -198,6 +198,10 @@ def test_outputs_are_checked_from_python(outside: Path, monkeypatch: pytest.Monk
     with pytest.raises(PluginError, match="'grid' on image given: got ndarray, expected LocalF"):
         megloc.extract("grid", image)
 
+    given: Any = kind()
+    with pytest.raises(PluginError, match="a plugin is given by its registered name, got <outside"):
+        megloc.extract(given, image)
+
     def reject(*_: object) -> None:
         raise DataError("too small")
 
