@@ -43,7 +43,8 @@ class Threshold(Options):
         parts = text.replace(",", " ").split()
         try:
             numbers = [float(part) for part in parts]
-            if len(numbers) not in (1, 2):
+            # shells split "0.25, 2" into two arguments
+            if len(numbers) not in (1, 2) or text.endswith(","):
                 raise ValueError
             return cls(position_m=numbers[0], angle_deg=numbers[1] if len(numbers) == 2 else None)
         except ValueError as error:  # pydantic's errors are ValueErrors too

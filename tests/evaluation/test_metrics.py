@@ -25,6 +25,8 @@ def test_parse_and_print() -> None:
     assert str(Threshold.parse("0,0")) == "0 m, 0 deg"
     position_only = Threshold.parse(" 0.1 ")
     assert position_only.angle_deg is None and str(position_only) == "0.1 m"
+    with pytest.raises(OptionError, match="threshold '0.25,' is not METRES,DEGREES"):
+        Threshold.parse("0.25,")
 
 
 def test_missing_poses_have_infinite_errors() -> None:
