@@ -126,6 +126,10 @@ def plugin_class(group: str, name: str) -> Any:
             f"plugin {name!r} ({entries[0].value}) does not implement {protocol.__name__}: "
             f"it {what}"
         )
+    model: Any = getattr(kind, "Options", Options)
+    if not isinstance(model, type) or not issubclass(model, Options):
+        base = f"{Options.__module__}.{Options.__name__}"
+        raise PluginError(f"plugin {name!r}: its Options are not derived from {base}")
     return kind
 
 

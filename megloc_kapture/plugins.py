@@ -1,7 +1,7 @@
 """Plugin protocols; ``plugin_loading.py`` loads plugins by name.
 
 A plugin is a class registered under one of the entry-point groups below, as the built-in ones are.
-Its instances must be picklable. It may have ``Options``, a frozen pydantic model that is the only
+Its instances must be picklable. It may have ``Options``, derived from ``values.Options``, the only
 argument of its constructor, and a method ``weights() -> dict[str, str]``: the sha256 of each weight
 file by name, which becomes part of a stage's fingerprint and manifest.
 """

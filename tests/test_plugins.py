@@ -46,6 +46,10 @@ MODULE = """
     class Plain(Nameless):
         name = "plain"
 
+    class Loose(Plain):
+        class Options:
+            step = 50
+
     class Deaf:
         name = "deaf"
 
@@ -56,7 +60,7 @@ MODULE = """
         def __init__(self):
             raise ValueError("not today")
 """
-NAMES = ("Grid", "Plain", "Nameless", "Deaf", "function", "Moody", "Absent")
+NAMES = ("Grid", "Plain", "Nameless", "Deaf", "Loose", "function", "Moody", "Absent")
 ENTRY_POINTS = f"""
     [megloc_kapture.local_features]
     {"".join(f"{name.lower()} = outside_plugin:{name}{chr(10)}    " for name in NAMES)}
@@ -107,6 +111,7 @@ def test_a_plugin_of_another_package_is_found_and_works(outside: Path) -> None:
     [
         ("nameless", r"'nameless' \(outside_plugin:Nameless\) does not implement L.* lacks name"),
         ("deaf", r"'deaf' \(outside_plugin:Deaf\) does not implement LocalF.* lacks extract"),
+        ("loose", "'loose': its Options are not derived from megloc_kapture.values.Options"),
         ("function", r"'function' .* does not implement LocalFeatureExtractor: it is not a class"),
         ("absent", r"'absent' \(outside_plugin:Absent\) cannot be loaded: .*Absent"),
         ("broken", r"'broken' \(outside_plugin_broken:Grid\) cannot be loaded: no licence"),
