@@ -8,10 +8,11 @@ the batches, and the executor runs the last step.
 from __future__ import annotations
 
 import os
+import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import chain, groupby, islice
@@ -135,6 +136,14 @@ def ordered_map(
     if executor is None:
         yield from map(function, items)
         return
+    if isinstance(executor, ProcessPoolExecutor):
+        try:
+            pickle.dumps(function)
+        except Exception as error:  # of a plugin's class, or of what it holds
+            raise PluginError(
+                f"a plugin cannot be sent to other processes: {error}; let a function with "
+                "functools.lru_cache create such objects, or use --executor inline"
+            ) from error
     window = max(window, getattr(executor, "window", 0))
     waiting: deque[Future[Result]] = deque()
     try:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from copy import copy
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -323,6 +324,14 @@ def test_results_are_in_order() -> None:
     with ThreadPoolExecutor(3) as executor:
         assert list(ordered_map(work, range(20), executor, window=8)) == list(range(20))
         assert list(ordered_map(work, [], executor)) == []
+    sift: Any = partial(pow, cv2.SIFT.create())  # as a plugin that creates it in __init__
+    with (
+        ProcessPoolExecutor(2) as pool,
+        pytest.raises(
+            PluginError, match=r"a plugin cannot be sent .*: cannot pickle 'cv2\.SIFT' obj"
+        ),
+    ):
+        list(ordered_map(sift, [1], pool))
     # without an executor results are computed lazily
     done: list[int] = []
     results = ordered_map(lambda value: done.append(value) or value, [3, 1, 2])
