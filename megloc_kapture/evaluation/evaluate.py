@@ -27,6 +27,7 @@ from megloc_kapture.evaluation.results import (
     read_result,
     result_in_memory,
     side_tables_near,
+    with_names_of,
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.geometry.poses import (
@@ -171,7 +172,7 @@ def evaluate_results(
             evaluate_pairs(result, true_poses, benchmark, references, thresholds=thresholds)
             for result in read
         ]
-    true_poses = _by_names_of_results(true_poses, read, {*nowhere, *benchmark.names})
+    true_poses, read = _by_common_names(true_poses, read, {*nowhere, *benchmark.names})
     evaluations = []
     for result in read:
         aligned, note = _aligned(result, true_poses, align)
@@ -236,13 +237,17 @@ def _read(
     return read
 
 
-def _by_names_of_results(
+def _by_common_names(
     true_poses: Poses, results: Sequence[Result], known: Collection[str]
-) -> Poses:
-    """Rename the true poses if their folders differ from the results', so that no names match."""
+) -> tuple[Poses, list[Result]]:
+    """Rename true poses and results whose folders differ from each other's, so that no name fits.
+
+    True poses get the names of the results, unless these differ among themselves.
+    """
     images = {image for result in results for image in result.images}
     if not images & true_poses.keys():
         true_poses = poses_by_image(true_poses, images)
+    results = [with_names_of(result, true_poses.keys() | known) for result in results]
     for result in results:
         # queries that failed are in status.csv only
         names = {*result.images, *result.statuses}
@@ -252,7 +257,7 @@ def _by_names_of_results(
                 f"{min(true_poses, default='nothing')!r}"
                 + (f" ({result.label})" if result.label else "")
             )
-    return true_poses
+    return true_poses, results
 
 
 def _in_local_frame(

@@ -21,7 +21,7 @@ from functools import cache
 from importlib import metadata
 from itertools import islice
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -39,6 +39,7 @@ _log = logging.getLogger(__name__)
 
 COLUMNS = "name qw qx qy qz tx ty tz"
 
+Value = TypeVar("Value")
 Poses = Mapping[str, RigidTransform]
 RelativePoses = dict[tuple[int, int], RigidTransform | None]
 """Timestamps of reference and query -> ``query_from_reference``, None if the row has no pose."""
@@ -163,8 +164,8 @@ def _in_column_order(rows: Iterable[tuple[int, list[str]]]) -> Iterator[tuple[in
 
 
 def poses_by_image(
-    poses: Poses, images: Iterable[str], names: Mapping[str, str] | None = None
-) -> dict[str, RigidTransform]:
+    poses: Mapping[str, Value], images: Iterable[str], names: Mapping[str, str] | None = None
+) -> dict[str, Value]:
     """Rename the poses of a pose file to the images of a kapture folder.
 
     A name is looked up in this order: in the challenge's list ``names`` (image -> name), as an

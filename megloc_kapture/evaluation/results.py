@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os.path
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -192,6 +192,22 @@ def read_result(
         if image in poses
     }
     return Result(label, poses, tuple(sorted(poses)), statuses)
+
+
+def with_names_of(result: Result, images: Collection[str]) -> Result:
+    """Rename the queries of a result whose names differ from all of ``images`` by their folders."""
+    old = {*result.images, *result.statuses}
+    if not old.isdisjoint(images):
+        return result
+    named_as = pose_files.poses_by_image({name: name for name in sorted(old)}, images)
+    new = {former: name for name, former in named_as.items()}
+    return replace(
+        result,
+        poses={new[former]: pose for former, pose in result.poses.items()},
+        images=tuple(sorted(new[former] for former in result.images)),
+        statuses={new[former]: status for former, status in result.statuses.items()},
+        covariances={new[former]: matrix for former, matrix in result.covariances.items()},
+    )
 
 
 def read_poses(source: Path) -> dict[str, RigidTransform]:

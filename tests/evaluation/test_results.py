@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -272,6 +273,22 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
         evaluate(tmp_path / "poses.txt", truth)
     with pytest.raises(DataError, match=r"'a.jpg': ndarray is not a pose; use RigidTransform"):
         evaluate({"a.jpg": np.eye(4)}, truth)  # type: ignore[dict-item]
+
+
+def test_results_that_name_the_queries_by_different_folders(
+    world: Any, truth: Path, result: Path, tmp_path: Path
+) -> None:
+    names = [f"seq/{name}" for name in world.truth]
+    poses = {f"seq/{name}": pose for name, pose in world.estimated.items()}
+    longer = write_kapture(tmp_path / "longer", names, poses)
+    statuses = [replace(status, name=f"seq/{name}") for name, status in world.statuses.items()]
+    write_status(longer / "status.csv", statuses)
+    first, second = evaluate_results([result, longer], truth, SideTables())
+    assert first.rows == second.rows and first.row().num_localized > 0
+    assert [q.reason for q in first.queries] == [q.reason for q in second.queries]
+    longest = write_kapture(tmp_path / "gt", names, {f"seq/{n}": p for n, p in world.truth.items()})
+    again = evaluate_results([longer, result], longest, SideTables())
+    assert [evaluation.rows for evaluation in again] == [first.rows, first.rows]
 
 
 def test_a_result_with_poses_of_other_images_only_is_a_miss(
