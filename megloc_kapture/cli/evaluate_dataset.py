@@ -94,6 +94,8 @@ class Eval(Deciding, Working):
         self._check_truth(run.source)
         place = self.workspace or run.default_workspace
         submissions = self.submissions or (None if self.workspace else Path(FOLDER))
+        is_file = submissions is not None and submissions.is_file()
+        check_option(not is_file, f"--submissions: {submissions} is a file; give a folder")
         workspace = Workspace(place, force=self.force)
         with self.working_in(workspace) as work:
             work = replace(work, force=self.force)

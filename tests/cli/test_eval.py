@@ -153,12 +153,14 @@ def test_a_moved_dataset_repeats_the_import_and_a_changed_image_the_features(
 # ------------------------------------------------------------------ parts of a run
 
 
-def test_import_options_reach_the_dataset(megloc: Any, tmp_path: Path) -> None:
+def test_options_are_checked_before_the_run(megloc: Any, tmp_path: Path) -> None:
     command = ("eval", "aachen", "--root", write_v1_0(tmp_path / "root"), "-w", tmp_path / "run")
     done = megloc(*command, "--import-option", "version=1.1", "--dry-run")
     assert done.status == 2 and "the model of Aachen Day-Night v1.1 is missing" in done.err
     done = megloc(*command, "--import-option", "version")
     assert done.status == 2 and "--import-option takes key=value" in done.err
+    done = megloc(*command, "--dry-run", "--submissions", __file__)
+    assert done.status == 2 and "test_eval.py is a file; give a folder" in done.err
 
 
 def test_from_uses_files_of_another_tool_as_they_are(
