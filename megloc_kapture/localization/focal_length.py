@@ -116,8 +116,8 @@ def focal_misfit(
         return None
     # the inliers of a grossly wrong focal length favour it, or their fit does not converge, so
     # search again among all matches
-    if (found := _with_focal_from_matches(problem, options)) is not None:
-        other, estimate = found
+    if (alternative := _with_focal_from_matches(problem, options)) is not None:
+        other, estimate = alternative
         start = estimate.rig_from_world, estimate.inliers
         second = _freed(other, given, *start, options.max_error_px)
         if second is not None and (
@@ -229,8 +229,8 @@ def estimate_with_intrinsics(
     """
     given = problem.views[0].camera
     best = estimate_pose(problem, options)
-    if (found := _with_focal_from_matches(problem, options)) is not None:
-        other, of_other = found
+    if (alternative := _with_focal_from_matches(problem, options)) is not None:
+        other, of_other = alternative
         if of_other.num_inliers > best.num_inliers and _is_possible(other, of_other, given):
             problem, best = other, of_other
     if isinstance(best, PoseEstimate):

@@ -23,9 +23,7 @@ from megloc_kapture.io.kapture.features import (
     features_dir_hint,
     list_types,
 )
-from megloc_kapture.io.kapture.matches import (
-    MatchesReader,
-)
+from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.io.kapture.points import Observations, read_observations, read_points3d
 from megloc_kapture.io.kapture.sensors import KaptureData, read_kapture_data
 
