@@ -103,8 +103,9 @@ def _write_vectors(
     folder_of = images_of(folders, "describe")
     is_written = partial(has_features, output, "global_features", type_name)
     images, label = work.unfinished(folder_of, is_written, label)
-    # images of equal size can share a batch
-    jobs = sorted(((image, folder_of[image]) for image in images), key=size_of)
+    jobs = [(image, folder_of[image]) for image in images]
+    if isinstance(describe, Batched):  # images of equal size can share a batch
+        jobs.sort(key=size_of)
     writer: FeatureWriter | None = None
     results = work.map(describe, jobs, label)
     for (image, _), vector in zip(jobs, results, strict=True):

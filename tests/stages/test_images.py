@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -462,6 +463,16 @@ def test_the_vocabulary_does_not_depend_on_the_queries(world: Any, tmp_path: Pat
     alone, both = folder_bytes(tmp_path / PLACE), folder_bytes(world.features_dir / PLACE)
     assert set(both) - set(alone) == {f"global_features/{q}.gfeat" for q in world.query_poses}
     assert all(both[name] == content for name, content in alone.items())
+
+
+def test_vectors_of_descriptors_need_no_calibrated_camera(world: Any, tmp_path: Path) -> None:
+    data = world.query().read()
+    unknown = {name: Sensor("", "camera", ("UNKNOWN_CAMERA", "9", "9")) for name in data.sensors}
+    write_sensors(tmp_path / "query", replace(data, sensors=unknown))
+    query = KaptureFolder(tmp_path / "query", features_dirs=[world.features_dir])
+    extract_vlad(world.mapping(), [query], "rootsift", tmp_path, VLAD)
+    vectors = query.with_features([tmp_path]).global_features("vlad_rootsift")
+    assert vectors.names == sorted(world.query_poses)
 
 
 def test_a_map_without_descriptors_is_refused(
