@@ -1,4 +1,4 @@
-"""Output folders of commands: ownership, and output that appears only on success.
+"""Output folders of commands: their ownership, and output that appears only on success.
 
 A command may write to a folder that is new, empty, or marked as a folder of the command's kind. The
 mark is a file that lists this kind and the files written by the last command; the next command
@@ -28,7 +28,7 @@ ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 
 
 def claim_folder(folder: Path, *, kind: str, force: bool = False) -> bool:
-    """Create and mark a folder that is new, empty or of the same ``kind`` (one word).
+    """Create and mark a folder that is new, empty or already marked with ``kind`` (one word).
 
     Raise OutputError for any other folder, unless forced. Return whether the mark is new;
     :func:`release_folder` may then remove it.
@@ -46,17 +46,17 @@ def check_claim(folder: Path, *, kind: str, force: bool = False) -> None:
     """Raise OutputError for a folder that :func:`claim_folder` rejects."""
     with writing(folder):
         if folder.exists() and not folder.is_dir():
-            raise OutputError(f"{folder}: is a file, a folder is needed")
+            raise OutputError(f"{folder}: is a file; give a folder")
         ours = force or not folder.exists() or _read_mark(folder)[:1] == [kind]
         if not ours and any(folder.iterdir()):
             raise OutputError(
-                f"{folder}: is not empty and no earlier output of this kind ({kind}); give an "
+                f"{folder}: is not empty and not an earlier output of this kind ({kind}); give an "
                 "empty folder, or -f to write into it anyway"
             )
 
 
 def check_new_file(path: Path, *, force: bool) -> None:
-    """Raise OutputError for a folder, or unless forced for an existing file."""
+    """Raise OutputError if ``path`` is a folder or, unless forced, an existing file."""
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file")
     if path.exists() and not force:
@@ -96,13 +96,18 @@ def staged_output(
     """
     folder = Path(folder)
     if any(Path(path).resolve().is_relative_to(folder.resolve()) for path in inputs if path):
-        raise OutputError(f"{folder}: is or contains an input, which may be lost; give another one")
-    is_other = (folder / "sensors" / "sensors.txt").is_file() and _read_mark(folder)[:1] != [kind]
-    if is_other and not adds:
-        raise OutputError(f"{folder}: has other kapture data, which is kept; give an empty folder")
+        raise OutputError(
+            f"{folder}: is or contains an input, which the output could overwrite; "
+            "give another folder"
+        )
+    is_foreign = (folder / "sensors" / "sensors.txt").is_file() and _read_mark(folder)[:1] != [kind]
+    if is_foreign and not adds:
+        raise OutputError(
+            f"{folder}: holds other kapture data, which is never overwritten; give an empty folder"
+        )
     check_claim(folder, kind=kind, force=force)
-    place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
-    staging = place / temporary_name()
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
+    staging = existing / temporary_name()
     try:
         with writing(folder):
             staging.mkdir()
@@ -111,7 +116,7 @@ def staged_output(
             clear_temporary(staging)
             claim_folder(folder, kind=kind, force=True)
             if not adds:
-                new = _files_below(staging)
+                new = _relative_names(staging)
                 _remove_old_files(folder, set(_read_mark(folder)[1:]) - new)
                 _write_mark(folder, kind, new)
             _merge(staging, folder)
@@ -124,14 +129,13 @@ def staged_output(
         shutil.rmtree(staging, ignore_errors=True)
 
 
-def _files_below(folder: Path) -> set[str]:
-    files_below = set()
+def _relative_names(folder: Path) -> set[str]:
+    """Return the files and links below a folder, relative to it."""
+    names = set()
     for place, folders, files in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
-        files_below |= {
-            os.path.relpath(os.path.join(place, name), folder) for name in files + links
-        }
-    return files_below
+        names |= {os.path.relpath(os.path.join(place, name), folder) for name in files + links}
+    return names
 
 
 def _remove_old_files(folder: Path, names: Iterable[str]) -> None:
@@ -159,7 +163,7 @@ def _merge(source: Path, target: Path) -> None:
 
 
 def files_below(*folders: Path) -> Iterator[Path]:
-    """Yield the files below folders, without archives, hidden files and outputs of commands.
+    """Yield the files below folders, except archives, hidden files and outputs of commands.
 
     Links are followed. Archives are omitted so that the files of a dataset stay the same when its
     archives are deleted after unpacking.
@@ -168,13 +172,13 @@ def files_below(*folders: Path) -> Iterator[Path]:
         for place, names, files in os.walk(root, followlinks=True):
             here = Path(place)
             names[:] = [name for name in names if _is_data(here, name)]
-            shown = (here / n for n in files if not (n.startswith(".") or n.endswith(ARCHIVES)))
-            yield from (path for path in shown if path.is_file())
+            paths = (here / n for n in files if not (n.startswith(".") or n.endswith(ARCHIVES)))
+            yield from (path for path in paths if path.is_file())
 
 
 def _is_data(folder: Path, name: str) -> bool:
     path = folder / name
     if name.startswith(".") or (path / MARKER).is_file():
         return False
-    # following a link to a parent folder would never end
+    # a link to a parent folder would be followed forever
     return not (path.is_symlink() and folder.resolve().is_relative_to(path.resolve()))

@@ -315,7 +315,7 @@ def test_a_workspace_is_reused_and_an_empty_one_removed(tmp_path: Path) -> None:
 
 def test_other_folders_are_used_only_by_force(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(OutputError, match="no earlier output of this kind .workspace"):
+    with pytest.raises(OutputError, match="not an earlier output of this kind .workspace"):
         Workspace(tmp_path)
     use(Workspace(tmp_path, force=True))
     Workspace(tmp_path)
