@@ -35,8 +35,8 @@ def point_covariances(
 ) -> Floats:
     """Return covariances (N, 6) of points (N, 3) as xx, xy, xz, yy, yz, zz for a noise of 1 px.
 
-    Observations (O,) are in any order; those with the point behind the camera are ignored. NaN if
-    the observations do not determine the point.
+    Observations (O,) may be in any order; those with the point behind the camera are ignored. NaN
+    if the observations do not determine the point.
     """
     from numba import get_num_threads  # numba loads slowly
 
@@ -65,7 +65,7 @@ def point_covariances(
 
 
 def point_deviations(covariances: Floats) -> Floats:
-    """Return standard deviations (N, 3) along principal axes, ascending; NaN if unknown."""
+    """Return standard deviations (N, 3) along the principal axes, ascending; NaN if unknown."""
     deviations = np.full((len(covariances), 3), np.nan)
     known = np.isfinite(covariances).all(axis=1)
     matrices = covariances[known][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
@@ -75,11 +75,11 @@ def point_deviations(covariances: Floats) -> Floats:
 
 
 class UncertaintyOptions(Options):
-    """Limit of the points' uncertainty.
+    """Limit on the uncertainty of points.
 
     The uncertainty is the largest standard deviation of a point over all directions, for a keypoint
-    noise of 1 px, divided by the point's depth. Points of unknown uncertainty, which have a single
-    observation and come from depth, are kept.
+    noise of 1 px, divided by the point's mean depth. Points of unknown uncertainty, such as points
+    lifted from a depth map, which have a single observation, are kept.
     """
 
     max_robust_sigmas: float | None = Field(
@@ -90,9 +90,9 @@ class UncertaintyOptions(Options):
     )
 
 
-def rows_of_each(ids: NDArray[np.integer], count: int) -> list[NDArray[np.int64]]:
-    """Return the rows in ``ids`` (O,) of each id from 0 to ``count`` - 1, ascending."""
-    # numpy sorts integers of 16 bits in linear time
+def rows_by_id(ids: NDArray[np.integer], count: int) -> list[NDArray[np.int64]]:
+    """Return, for each id from 0 to ``count`` - 1, its rows in ``ids`` (O,), ascending."""
+    # numpy sorts 16-bit integers in linear time
     order = np.argsort(ids.astype(np.uint16) if count < 1 << 16 else ids, kind="stable")
     return np.split(order, np.cumsum(np.bincount(ids, minlength=count))[:-1])
 
@@ -103,7 +103,7 @@ def mean_depths(
     image_ids: NDArray[np.int32],
     cams_from_world: Sequence[RigidTransform],
 ) -> Floats:
-    """Return mean depths (N,) of the points in their images; NaN without observations (O,)."""
+    """Return mean depths (N,) of points in the images that observe them; NaN if there are none."""
     axes = np.array([pose.rotation_matrix()[2] for pose in cams_from_world]).reshape(-1, 3)
     offsets = np.array([pose.translation[2] for pose in cams_from_world])
     depths = np.einsum("oi,oi->o", axes[image_ids], xyz[point_ids]) + offsets[image_ids]
@@ -113,13 +113,16 @@ def mean_depths(
 
 
 def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) -> Mask:
-    """Return a mask (N,) of points to reject by largest standard deviation and mean depth (N,)."""
+    """Return a mask (N,) of points to reject by their largest deviation and mean depth (N,).
+
+    See :class:`UncertaintyOptions`.
+    """
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         relative = deviations / depths
-        usual = relative[np.isfinite(relative) & (relative > 0)]
-        if len(usual) == 0:
+        valid = relative[np.isfinite(relative) & (relative > 0)]
+        if len(valid) == 0:
             return np.zeros(len(deviations), dtype=bool)
-        logarithms = np.log(usual)
+        logarithms = np.log(valid)
         median = float(np.median(logarithms))
         deviation = float(deviation_by_median(logarithms - median))
         return np.asarray(relative > np.exp(median + max_robust_sigmas * deviation))

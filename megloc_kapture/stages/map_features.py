@@ -27,7 +27,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.features import ArrayKind
 from megloc_kapture.io.kapture.folder import ARRAY_KINDS
-from megloc_kapture.mapping.uncertainty import rows_of_each
+from megloc_kapture.mapping.uncertainty import rows_by_id
 
 # detector implementations differ by tenths of a pixel
 _MAX_SHIFT_PX = 1.0
@@ -98,7 +98,7 @@ def _moved(
     stored, extracted = reference.keypoints(local_type), mapping.keypoints(local_type)
     point_ids, image_ids, keypoint_ids = [], [], []
     rows_of, num_found = {}, 0
-    for row, rows in enumerate(rows_of_each(seen.image_ids, len(seen.image_names))):
+    for row, rows in enumerate(rows_by_id(seen.image_ids, len(seen.image_names))):
         image = seen.image_names[row]
         if len(rows) == 0:
             continue

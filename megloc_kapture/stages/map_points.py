@@ -188,10 +188,10 @@ class MakePoints(PipelineStage):
         paths.GLOBAL_FEATURES,
         PipelineStage.mapping_matches,
     )
-    outputs = (paths.UNREFINED,)
+    outputs = (paths.UNREFINED_MAP,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        options, out = self.options, work.out / paths.UNREFINED
+        options, out = self.options, work.out / paths.UNREFINED_MAP
         mapping = work.folder(self.mapping(), paths.FEATURES, *self.mapping_matches())
         if not options.triangulates():
             return lift_map(mapping, options.local_types(), out, work=work)

@@ -1,4 +1,4 @@
-"""Stage: map refinement, which removes wrong and uncertain points and writes covariances.
+"""Stage: map refinement, which removes wrong and uncertain points and writes point covariances.
 
 ``reconstruction/refinement.json`` lists the removals of each filter.
 """
@@ -39,7 +39,7 @@ from megloc_kapture.mapping.uncertainty import (
     mean_depths,
     point_covariances,
     point_deviations,
-    rows_of_each,
+    rows_by_id,
     too_uncertain,
 )
 from megloc_kapture.stages import paths
@@ -51,8 +51,8 @@ from megloc_kapture.values import Options
 
 # a point that loses observations is dropped if fewer than this remain
 _MIN_OBSERVATIONS = 2
-# images with the same centre form a scan; points from one depth map are compared with the nearest
-# scans
+# images with the same centre form a scan; points lifted from a depth map are compared with the
+# nearest other scans
 _SAME_CENTRE_M = 1e-3
 _NEIGHBOURING_SCANS = 10
 
@@ -85,12 +85,12 @@ class MapSelection:
         self.image_ids = _joined(rows, np.int32)
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
         self.kept = self.image_ids >= 0
-        # by filter: the points or observations that it could judge, and its removals
+        # per filter: the number of points or observations that it could check and that it removed
         self.reports: list[dict[str, Any]] = []
         self._covariances: Floats | None = None
 
     def covariances(self) -> Floats:
-        """Return covariances (N, 6) from the kept observations; NaN where undetermined."""
+        """Return point covariances (N, 6) from the kept observations; NaN where undetermined."""
         if self._covariances is None:
             ids = self.point_ids[self.kept], self.image_ids[self.kept]
             views = self.cameras, self.cams_from_world
@@ -98,34 +98,34 @@ class MapSelection:
         return self._covariances
 
     def depths(self) -> Floats:
-        """Return mean depths (N,) of the points in their images, from the kept observations."""
+        """Return mean depths (N,) of the points in the images of their kept observations."""
         ids = self.point_ids[self.kept], self.image_ids[self.kept]
         return mean_depths(self.xyz, *ids, self.cams_from_world)
 
-    def drop_observations(self, name: str, dropped: Mask, checked: int) -> None:
-        """Drop observations (O,), and points left with too few."""
+    def drop_observations(self, name: str, dropped: Mask, num_checked: int) -> None:
+        """Drop observations (O,), and points that are left with too few."""
         dropped = dropped & self.kept
         ids = self.point_ids[self.kept]
-        gone = left_with_too_few(ids, dropped[self.kept], len(self.xyz), _MIN_OBSERVATIONS)
-        self._take_out(name, dropped, gone, checked)
+        points = left_with_too_few(ids, dropped[self.kept], len(self.xyz), _MIN_OBSERVATIONS)
+        self._remove(name, dropped, points, num_checked)
 
-    def drop_points(self, name: str, dropped: Mask, checked: int) -> None:
+    def drop_points(self, name: str, dropped: Mask, num_checked: int) -> None:
         """Drop points (N,) with their observations."""
-        self._take_out(name, np.zeros(len(self.kept), dtype=bool), dropped, checked)
+        self._remove(name, np.zeros(len(self.kept), dtype=bool), dropped, num_checked)
 
-    def _take_out(self, name: str, observations: Mask, points: Mask, checked: int) -> None:
-        gone = self.kept & (observations | points[self.point_ids])
+    def _remove(self, name: str, observations: Mask, points: Mask, num_checked: int) -> None:
+        removed = self.kept & (observations | points[self.point_ids])
         self.reports.append(
             {
                 "name": name,
-                "checked": checked,
+                "checked": num_checked,
                 "points": int((points & self.kept_points).sum()),
-                "observations": int(gone.sum()),
+                "observations": int(removed.sum()),
             }
         )
-        if self._covariances is not None and (gone & ~points[self.point_ids]).any():
+        if self._covariances is not None and (removed & ~points[self.point_ids]).any():
             self._covariances = None  # points that lose some observations become less certain
-        self.kept &= ~gone
+        self.kept &= ~removed
         self.kept_points &= ~points
 
     def observations(self) -> dict[str, Observations]:
@@ -170,8 +170,8 @@ def refine_map(
     """Write a map without the points and observations that the options reject.
 
     Points are renumbered. Observations by images without a pose are dropped. ``link_features``
-    allows hard links to the features inside the source folder, which must not be user data. Return
-    counts for the log.
+    allows hard links to the features in the source folder; set it only if these are not user data.
+    Return counts for the log.
     """
     check_points(source, "refine")
     selection = MapSelection(source)
@@ -229,7 +229,7 @@ def _verify_depth(
     observing = selection.image_ids[triangulated]
     rows_of = [
         (image, triangulated[rows])
-        for image, rows in enumerate(rows_of_each(observing, len(selection.images)))
+        for image, rows in enumerate(rows_by_id(observing, len(selection.images)))
         if image in with_depth and len(rows)
     ]
 
@@ -257,7 +257,7 @@ def _verify_depth(
 def _scans(
     selection: MapSelection, images: Sequence[int], tables: SideTables
 ) -> tuple[list[list[int]], list[set[int]]]:
-    """Return the images with depth of each scan, and the nearest scans of each."""
+    """Return the images with depth of each scan, and the other scans nearest to it."""
     scans: list[list[int]] = []
     neighbours: list[set[int]] = []
     for members in tables.frames([selection.images[row] for row in images]):
@@ -271,10 +271,10 @@ def _scans(
         for scan, row in zip(scan_of.tolist(), rows, strict=True):
             scans[first + scan].append(row)
         centres = centres[np.unique(scan_of, return_index=True)[1]]
-        # the nearest is the scan itself, which is removed below
+        # the nearest scan is the scan itself, which is removed below
         ranks = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
         nearest = cKDTree(centres).query(centres, k=ranks)[1] + first
-        neighbours += [set(others) - {at} for at, others in enumerate(nearest.tolist(), first)]
+        neighbours += [set(near) - {scan} for scan, near in enumerate(nearest.tolist(), first)]
     return scans, neighbours
 
 
@@ -286,32 +286,31 @@ def _votes_of_other_scans(
     options: DepthVerificationOptions,
     work: Work,
 ) -> tuple[NDArray[np.int64], Mask]:
-    """Return the sums of votes (L,) of nearby scans on lifted points, and a mask of those judged.
+    """Return sums of votes (L,) of nearby scans on lifted points, and a mask of points with votes.
 
-    ``lifted`` (L,) are the rows of the points' observations.
-
-    A scan votes +1 if it has a surface at the point, -1 if it sees through the point.
+    ``lifted`` (L,) are the rows of the points' observations. A scan votes +1 if it has a surface at
+    the point, -1 if it sees through the point.
     """
     scan_of = np.full(len(selection.images), -1)
     for number, images in enumerate(scans):
         scan_of[images] = number
-    rows_of_scan = rows_of_each(scan_of[selection.image_ids[lifted]], len(scans))
+    rows_of_scan = rows_by_id(scan_of[selection.image_ids[lifted]], len(scans))
     judged_rows: list[list[NDArray[np.int64]]] = [[] for _ in scans]
     for rows, others in zip(rows_of_scan, neighbours, strict=True):
         for other in others:
             judged_rows[other].append(rows)
-    asked = [
+    points_of_scans = [
         ([selection.images[row] for row in images], np.concatenate(parts))
         for images, parts in zip(scans, judged_rows, strict=True)
         if parts
     ]
     points = selection.point_ids[lifted]
     sigmas = depth_noise(selection.depths()[points], options.noise)
-    jobs = ((images, selection.xyz[points[rows]], sigmas[rows]) for images, rows in asked)
+    jobs = ((images, selection.xyz[points[rows]], sigmas[rows]) for images, rows in points_of_scans)
     judge = partial(_judge, selection.source, options)
     votes, judged = np.zeros(len(lifted), np.int64), np.zeros(len(lifted), bool)
-    results = work.map(judge, jobs, "depth of other scans", len(asked))
-    for (_, rows), (through, agreeing) in zip(asked, results, strict=True):
+    results = work.map(judge, jobs, "depth of other scans", len(points_of_scans))
+    for (_, rows), (through, agreeing) in zip(points_of_scans, results, strict=True):
         votes[rows] += agreeing.astype(np.int64) - through
         judged[rows] |= agreeing | through
     return votes, judged
@@ -322,15 +321,15 @@ def _judge(
     options: DepthVerificationOptions,
     job: tuple[list[str], Floats, Floats],
 ) -> tuple[Mask, Mask]:
-    """Return masks of points (N, 3): those that a scan's images see through, those on a surface."""
+    """Return masks of points (N, 3): those that a scan sees through, and those on its surface."""
     images, xyz, sigmas = job
     through, agreeing = np.zeros((2, len(xyz)), dtype=bool)
     for image in images:
         depth, cam_from_world = depth_and_pose(folder, image)
         points = cam_from_world.apply(xyz)
-        before, behind, checked = compare_with_depth(points, depth, options, sigmas)
-        through |= before
-        agreeing |= checked & ~before & ~behind
+        in_front, behind, checked = compare_with_depth(points, depth, options, sigmas)
+        through |= in_front
+        agreeing |= checked & ~in_front & ~behind
     return through & ~agreeing, agreeing
 
 
@@ -339,14 +338,14 @@ def _compare(
     options: DepthVerificationOptions,
     job: tuple[str, Floats, Floats],
 ) -> tuple[Mask, int]:
-    """Return a mask of points that an image's depth contradicts, and the number with depth."""
+    """Return a mask of points that an image's depth contradicts, and the number of tested ones."""
     image, xyz, covariances = job
     depth, cam_from_world = depth_and_pose(folder, image)
     axis = (depth.image_from_depth.inverse() @ cam_from_world).rotation_matrix()[2]
     sigmas = KEYPOINT_NOISE_PX * np.sqrt(_quadratic_form(covariances, axis))
     points = cam_from_world.apply(xyz)
-    before, behind, checked = compare_with_depth(points, depth, options, sigmas)
-    return before | behind, int(checked.sum())
+    in_front, behind, checked = compare_with_depth(points, depth, options, sigmas)
+    return in_front | behind, int(checked.sum())
 
 
 def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
@@ -358,7 +357,7 @@ def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
 
 def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None:
     deviations = point_deviations(selection.covariances())[:, 2]
-    # dropped points do not count in the map's median
+    # the map's median excludes dropped points
     deviations = np.where(selection.kept_points, deviations, np.nan)
     rejected = too_uncertain(deviations, selection.depths(), max_robust_sigmas)
     selection.drop_points("uncertainty", rejected, int(np.isfinite(deviations).sum()))
@@ -371,11 +370,11 @@ class RefineMap(PipelineStage):
     version = 3
     uses = ("refinement",)
     explained_by = ("refinement.depth.max_sigmas", "refinement.uncertainty.max_robust_sigmas")
-    inputs = (paths.UNREFINED, SIDE_TABLES)
+    inputs = (paths.UNREFINED_MAP, SIDE_TABLES)
     outputs = (PipelineStage.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        folder, out = work.folder(paths.UNREFINED), work.out / self.sparse_map()
+        folder, out = work.folder(paths.UNREFINED_MAP), work.out / self.sparse_map()
         counts = refine_map(
             folder,
             out,
@@ -386,7 +385,7 @@ class RefineMap(PipelineStage):
         )
         if not counts["points"]:
             raise DataError(
-                f"refinement leaves none of the {len(folder.points3d())} points. Check the map's "
-                "poses and cameras, or loosen the limits (--set refinement.KEY=VALUE)"
+                f"refinement removed all {len(folder.points3d())} points. Check the map's poses "
+                "and cameras, or loosen the limits (--set refinement.KEY=VALUE)"
             )
         return counts
