@@ -45,7 +45,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization import confidence
 from megloc_kapture.localization.confidence import MAP_POINTS, TERMS
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.pipeline.presets import parse_assignments
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
@@ -146,7 +146,7 @@ def collect(
     with TemporaryDirectory() as folder:
         workspace = Path(folder) / "map"
         built = megloc.build_map(
-            scene / "mapping", preset, set=assigned(changes), workspace=workspace
+            scene / "mapping", preset, set=parse_assignments(changes), workspace=workspace
         )
         keep_all = {"min_confidence": 0.0, "sure_confidence": None}
         localization = built.options.localization.model_copy(update=keep_all)

@@ -239,7 +239,7 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     with pytest.raises(megloc.OptionError, match="has its own cameras"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)
-    with pytest.raises(megloc.OptionError, match="photographs are given as files"):
+    with pytest.raises(megloc.OptionError, match="give photographs as files"):
         megloc.map_photographs([np.zeros((8, 8, 3))])  # type: ignore[list-item]
     with pytest.raises(megloc.DataError, match="nowhere"):
         megloc.open_map(tmp_path / "nowhere").localize(scene / "query")

@@ -255,10 +255,10 @@ class Computing:
 
     def placement(self) -> NetworkOptions:
         # slow imports
-        from megloc_kapture.pipeline.presets import assigned, options_with
+        from megloc_kapture.pipeline.presets import options_with, parse_assignments
         from megloc_kapture.stages.options import PipelineOptions
 
-        chosen = assigned(self.assignments()).items()
+        chosen = parse_assignments(self.assignments()).items()
         placed = {key: value for key, value in chosen if key in ("device", "precision")}
         return options_with(PipelineOptions, placed).placement
 
@@ -285,7 +285,7 @@ class Choosing(Computing):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deciding(Choosing):
+class Localizing(Choosing):
     """Flags of commands that localize."""
 
     min_confidence: float | None = None

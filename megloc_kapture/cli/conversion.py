@@ -35,7 +35,7 @@ from megloc_kapture.pipeline.datasets import (
 from megloc_kapture.pipeline.executors import open_executor
 from megloc_kapture.pipeline.export import ExportFormat, export
 from megloc_kapture.pipeline.map_making import import_colmap
-from megloc_kapture.pipeline.presets import assigned, options_with
+from megloc_kapture.pipeline.presets import options_with, parse_assignments
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.paths import MAP
 from megloc_kapture.stages.work import Work
@@ -87,7 +87,7 @@ class Import(Common):
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
             self.root,
-            import_options=assigned(self.set),
+            import_options=parse_assignments(self.set),
             query_prefix=self.query_prefix,
             allow_missing=self.allow_missing,
         )
@@ -141,7 +141,7 @@ class Synth(Working):
     force: Force = False
 
     def run(self) -> None:
-        changes = {"seed": self.seed, **assigned(self.set)}
+        changes = {"seed": self.seed, **parse_assignments(self.set)}
         twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
         with self.staged(self.output, DATASET, force=self.force) as (out, work):
             counts = twin.write(out, work)

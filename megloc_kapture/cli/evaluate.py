@@ -15,7 +15,7 @@ from megloc_kapture.errors import check_option, require
 from megloc_kapture.evaluation.check import check_submission, read_reference
 from megloc_kapture.evaluation.comparison import compare
 from megloc_kapture.evaluation.evaluate import (
-    benchmark_beside,
+    benchmark_near,
     evaluate_results,
     results_without_truth,
 )
@@ -56,28 +56,29 @@ class Evaluate(Common):
     """True poses: kapture folder, pose file or COLMAP model. If omitted, only statistics that need
     no true poses are computed."""
     dataset: str | None = None
-    """Dataset whose thresholds, conditions and pools apply: aachen, robotcar, 4seasons, inloc, ...;
-    if omitted, the workspace's protocol."""
+    """Dataset whose thresholds and (pooled) conditions apply: aachen, robotcar, 4seasons, inloc,
+    ...; if omitted, the workspace's protocol."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder for tables (text, JSON, CSV) and report.html."""
     thresholds: tuple[str, ...] = ()
     """Recall thresholds in metres and degrees, for example 0.25,2 0.5,5."""
     align: Literal["none", "se3", "sim3"] = "none"
-    """Align the poses with the truth first: sim3 with scale, for maps in an arbitrary frame and
-    scale; se3 without scale. Unlike evo's, the alignment ignores outliers."""
+    """Align the poses with the true poses first: sim3 with scale, for maps in an arbitrary frame
+    and scale; se3 without scale. Unlike evo's, the alignment is robust to outliers."""
     side_tables: Path | None = None
     """The workspace's megloc/ folder (conditions, protocol); if omitted, the megloc/ folder next to
     the true poses or the results."""
     map: Path | None = None
-    """Kapture folder of the map, for MLAD's pairs and the report; if omitted, the workspace's."""
+    """Kapture folder of the map, for 4Seasons' relocalization pairs and the report; if omitted, the
+    workspace's."""
     force: Force = False
 
     def run(self) -> None:
         check_option(self.input, "no result given; use -i")
         resolved = [path.resolve() for path in self.input]
-        twice = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
-        check_option(twice is None, f"{twice} is given twice")
-        benchmark = benchmark_beside(
+        repeated = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
+        check_option(repeated is None, f"{repeated} is given twice")
+        benchmark = benchmark_near(
             [self.gt, *self.input], side_tables=self.side_tables, dataset=self.dataset
         )
         thresholds = [Threshold.parse(text) for text in self.thresholds] or None
@@ -107,8 +108,8 @@ class Submit(Common):
     """Write the pose file of a localized kapture folder, and a JSON file with its provenance."""
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
-    """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a
-    twin."""
+    """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or
+    synthetic-X, the rendered twin of X."""
     input: Input
     """Localized kapture folder."""
     output: Output
@@ -145,7 +146,7 @@ class Submit(Common):
 def summary(counts: Mapping[str, int]) -> str:
     text = f"{counts['poses']} poses of {counts['scored']} queries"
     if counts["scored"] != counts["queries"] and not counts["dummies"]:
-        text += f" that are scored ({counts['queries']} in all)"
+        text += f" to be scored ({counts['queries']} in all)"
     parts = [
         f"{counts['missing']} missing" if counts["missing"] else "",
         "written as dummy poses" if counts["dummies"] else "",
@@ -155,7 +156,7 @@ def summary(counts: Mapping[str, int]) -> str:
     return ", ".join([text, *filter(None, parts)])
 
 
-# exit status if the check finds problems, the same as that of user errors
+# exit status if the check finds problems, as for user errors
 PROBLEMS_FOUND = 2
 _RUNS = Path("runs")
 
@@ -165,8 +166,8 @@ class Check(Common):
     """Check a pose file from any tool against the rules of its challenge and the map."""
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
-    """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a
-    twin."""
+    """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or
+    synthetic-X, the rendered twin of X."""
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Pose file; for 4seasons also the folder of all pose files."""
     data: Path | None = None
@@ -184,8 +185,8 @@ class Check(Common):
         if data is not None:
             reference = read_reference(data)
             tables = data / SIDE_TABLES
-            known = (tables / PROTOCOL_FILE).is_file()
-            check_dataset(self.dataset, reference.protocol, tables=tables if known else None)
+            has_protocol = (tables / PROTOCOL_FILE).is_file()
+            check_dataset(self.dataset, reference.protocol, tables=tables if has_protocol else None)
         report = check_submission(
             self.file, dataset=self.dataset.removeprefix(TWIN_PREFIX), reference=reference
         )
@@ -198,17 +199,17 @@ class Check(Common):
 
     def _workspace(self) -> Path | None:
         # runs/synthetic-aachen-classic, for example, is not a workspace of the dataset synthetic
-        longer = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
+        others = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
         workspaces = [
             path
             for path in sorted(_RUNS.glob(f"{self.dataset}-*"))
             if (path / "mapping" / "sensors" / "sensors.txt").is_file()
-            and not path.name.startswith(longer or "/")
+            and not path.name.startswith(others)
         ]
         if len(workspaces) == 1:
             self.say(f"compared with {workspaces[0]}")
             return workspaces[0]
         if workspaces:
             names = ", ".join(map(str, workspaces))
-            self.say(f"not compared: choose one of {names} with --data")
+            self.say(f"not compared with a workspace: choose one of {names} with --data")
         return None

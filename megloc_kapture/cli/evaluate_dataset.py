@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Deciding, Overwrite, Texts, Working
+from megloc_kapture.cli.common import Localizing, Overwrite, Texts, Working
 from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_TEXT, REPORT_HTML
@@ -19,27 +19,29 @@ from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import (
     choose_run,
     explain,
-    explained,
+    explanation_table,
     plan_evaluation,
     recall_rows,
 )
 from megloc_kapture.pipeline.plan import Workspace, all_kept, run_plan
-from megloc_kapture.pipeline.presets import assigned
+from megloc_kapture.pipeline.presets import parse_assignments
 from megloc_kapture.pipeline.submission import FOLDER, keep_submission
 from megloc_kapture.stages.paths import EVALUATION, LOCALIZED
 
-BELOW_RECALL = 3
+# exit status if the recall is below --fail-below
+RECALL_TOO_LOW = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eval(Deciding, Working):
-    """Run all stages on a dataset; results that are up to date are kept."""
+class Eval(Localizing, Working):
+    """Run all stages on a dataset, except those whose results are up to date."""
 
     dataset: tyro.conf.Positional[str] = "synthetic-aachen"
     """aachen, robotcar, 4seasons, inloc; synthetic-X: a rendered twin of one of them; kapture: any
-    pair of kapture folders; synthetic: the rendered world as plain kapture."""
+    kapture folders mapping/ and query/; synthetic: a rendered world as such folders."""
     root: Path | None = None
-    """Folder of the dataset in its published layout; if omitted, searched below MEGLOC_DATA."""
+    """Folder of the dataset in its published layout; if omitted, it is searched for below
+    MEGLOC_DATA."""
     allow_missing: bool = False
     """Accept a partial download."""
     workspace: Annotated[Path | None, tyro.conf.arg(aliases=["-w"])] = None
@@ -56,7 +58,7 @@ class Eval(Deciding, Working):
     thresholds: tuple[str, ...] = ()
     """Recall thresholds in metres and degrees, for example 0.25,2 0.5,5."""
     query_prefix: str = ""
-    """Put the queries into a folder of this name, if they share names with map images."""
+    """Folder to put the queries into; needed if they share names with map images."""
     from_stage: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Run this stage and its dependents again; use the results of earlier stages as they are."""
     until: str | None = None
@@ -77,26 +79,26 @@ class Eval(Deciding, Working):
             self.root,
             preset=self.preset,
             assignments=self.assignments(),
-            import_options=assigned(self.import_option, flag="--import-option"),
+            import_options=parse_assignments(self.import_option, flag="--import-option"),
             config=self.config,
             query_prefix=self.query_prefix,
             allow_missing=self.allow_missing,
             find_root=not self.explain,
         )
         if self.explain:
-            print(explained(explain(run.options)))
+            print(explanation_table(explain(run.options)))
             return 0
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
             pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
             benchmark = run.benchmark.model_copy(update={"thresholds": pairs})
             run = replace(run, benchmark=benchmark)
-        self._check_truth(run.source)
-        place = self.workspace or run.default_workspace
+        self._check_fail_below(run.source)
+        root = self.workspace or run.default_workspace
         submissions = self.submissions or (None if self.workspace else Path(FOLDER))
         is_file = submissions is not None and submissions.is_file()
         check_option(not is_file, f"--submissions: {submissions} is a file; give a folder")
-        workspace = Workspace(place, force=self.force)
+        workspace = Workspace(root, force=self.force)
         with self.working_in(workspace) as work:
             work = replace(work, force=self.force)
             stages = plan_evaluation(run)
@@ -114,26 +116,26 @@ class Eval(Deciding, Working):
         if all_kept(reports):
             self.say("nothing to do: every stage is up to date")
         done = {report.name: report for report in reports}
-        status = self._conclude(workspace, run.benchmark) if "evaluation" in done else 0
+        status = self._print_recall(workspace, run.benchmark) if "evaluation" in done else 0
         if "submission" in done:
             pose_file = run.submission_below(workspace.root, workspace.path(SIDE_TABLES))
-            self._hand_in(pose_file, submissions)
+            self._copy_pose_file(pose_file, submissions)
             doubtful = done["submission"].counts.get("doubtful", 0)
-            # only challenges, which have an adapter, have an evaluation server
+            # only datasets with an adapter have an evaluation server
             if doubtful and run.source.adapter is not None:
                 self.say(
-                    f"{doubtful:,} poses had too little confidence for the pose file; a server "
-                    "counts a missing pose as wrong: --set localization.min_confidence=0 keeps "
-                    "every pose"
+                    f"{doubtful:,} poses are not in the pose file, as their confidence is too low; "
+                    "a server counts a missing pose as wrong: --set localization.min_confidence=0 "
+                    "keeps every pose"
                 )
         report = workspace.path(EVALUATION) / REPORT_HTML
         if "evaluation" in done and report.is_file():
             print(f"report     {shown(report)}")
         return status
 
-    def _check_truth(self, choice: DatasetChoice) -> None:
+    def _check_fail_below(self, choice: DatasetChoice) -> None:
         if self.fail_below is not None and not 0.0 <= self.fail_below <= 1.0:
-            raise OptionError(f"--fail-below is a recall from 0 to 1, got {self.fail_below:g}")
+            raise OptionError(f"--fail-below must be a recall from 0 to 1, got {self.fail_below:g}")
         if self.fail_below is None:
             return
         if self.until not in (None, "evaluation"):
@@ -142,7 +144,8 @@ class Eval(Deciding, Working):
             choice.has_truth(), f"--fail-below needs true poses: {choice.root}/query_gt is missing"
         )
 
-    def _hand_in(self, pose_file: Path, submissions: Path | None) -> None:
+    def _copy_pose_file(self, pose_file: Path, submissions: Path | None) -> None:
+        """Copy the pose file to the folder of submissions, if given, and print its path."""
         if submissions is not None:
             kept = keep_submission(pose_file, submissions)
             if kept.name != pose_file.name:
@@ -152,7 +155,8 @@ class Eval(Deciding, Working):
             pose_file = kept
         print(f"pose file  {shown(pose_file)}")
 
-    def _conclude(self, workspace: Workspace, benchmark: BenchmarkFile) -> int:
+    def _print_recall(self, workspace: Workspace, benchmark: BenchmarkFile) -> int:
+        """Print the recall or agreement, and return the exit status."""
         evaluation = workspace.path(EVALUATION)
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
@@ -164,7 +168,7 @@ class Eval(Deciding, Working):
                 print((evaluation / text).read_text(encoding="utf-8"))
                 break
         if benchmark.published:
-            print("published (percent, on the official data):")
+            print("published recall (percent, on the official data):")
         for text in benchmark.published:
             print(f"  {text}")
         if self.fail_below is None:
@@ -173,7 +177,7 @@ class Eval(Deciding, Working):
         if recall >= self.fail_below:
             return 0
         self.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
-        return BELOW_RECALL
+        return RECALL_TOO_LOW
 
 
 def shown(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""``megloc localize`` and ``megloc serve``: localization in a kapture map (read only)."""
+"""``megloc localize`` and ``megloc serve``: localization in a kapture map, which is only read."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
-    Deciding,
     Input,
+    Localizing,
     Output,
     Overwrite,
     ReadingMap,
@@ -45,7 +45,7 @@ _LIMITS = ("threads", "max_waiting", "max_mb", "max_megapixels")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Localize(ReadingMap, Deciding, Common):
+class Localize(ReadingMap, Localizing, Common):
     """Localize photographs, or the images of a kapture folder, in a kapture map."""
 
     input: Input
@@ -78,12 +78,12 @@ class Localize(ReadingMap, Deciding, Common):
             folder = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
             if not folder.names:
                 name, reason = min(folder.unreadable.items())
-                raise DataError(f"no photograph can be used, the first is {name}: {reason}")
+                raise DataError(f"no photograph can be used; the first is {name}: {reason}")
         else:
             folder = self.kapture(self.query)
-        kapture_map = _consistent_map(self, self.input)
+        kapture_map = _open_consistent_map(self, self.input)
         candidates = None if self.pairs is None else candidates_of(read_pairs(self.pairs))
-        # fail before the first query and before anything is written
+        # invalid options and queries are rejected here, before anything is localized or written
         options = self.options()
         localizer = Localizer(kapture_map, options=options)
         results = Results(
@@ -104,20 +104,23 @@ class Localize(ReadingMap, Deciding, Common):
             outcomes = list(results.items())
             seconds = time.perf_counter() - started
             counts = results.write_to(out)
-        how = "as given"
+        source = "from --pairs"
         if candidates is None:
-            how = localizer.matching.describe_candidates(queries.types_of_all())
-        self.say(f"localizing with {', '.join(local.name for local in localizer.types)}")
-        self.say(f"candidates: {how}")
+            source = localizer.matching.describe_candidates(queries.shared_global_types())
+        self.say(f"localized with {', '.join(local.name for local in localizer.types)}")
+        self.say(f"candidates: {source}")
         self.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
         remarks = Counter(remark for _, result in outcomes for remark in result.remarks)
         focal = {remark for remark in remarks if "focal length" in remark}
         for remark in sorted(remarks.keys() - focal):
             self.say(f"skipped for {remarks[remark]} queries: {remark}")
         if not options.localization.rigs and len(queries.units(rigs=True)) < len(queries.names):
-            self.say("rigs: each camera alone; --set localization.rigs=true localizes them jointly")
+            self.say(
+                "the cameras of a rig were localized separately; --set localization.rigs=true "
+                "localizes them jointly"
+            )
         if kapture_map.unit != METRES:
-            self.say("positions are in units of the map, of unknown scale")
+            self.say("positions are in units of the map, whose scale is unknown")
         if misfits := misfits_text(results.values(), STATUS_FILE):
             self.say(misfits)
         print(
@@ -133,18 +136,18 @@ class Localize(ReadingMap, Deciding, Common):
             raise OptionError("give either --query (a kapture folder) or --images")
         check_option(
             self.query is None or (self.camera is None and self.every is None),
-            "--camera and --every are for --images; a kapture folder has cameras",
+            "--camera and --every apply to --images only; a kapture folder has its own cameras",
         )
         check_option(
             self.query is None or not self.query.is_file(),
-            f"--query {self.query}: not a kapture folder; a list of cameras goes to "
-            "--camera, the images to --images",
+            f"--query {self.query}: not a kapture folder; give images with --images and a list of "
+            "their cameras with --camera",
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve(ReadingMap, Deciding, Common):
-    """Serve localization in a kapture map over HTTP, with a web page for photographs."""
+class Serve(ReadingMap, Localizing, Common):
+    """Serve localization in a kapture map over HTTP, with a web page to upload photographs."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
@@ -159,9 +162,9 @@ class Serve(ReadingMap, Deciding, Common):
     max_waiting: int = 32
     """Number of images that may wait; further images are rejected (503)."""
     max_mb: float = 20.0
-    """Largest request, megabytes."""
+    """Largest request in megabytes."""
     max_megapixels: float = 32.0
-    """Largest image, megapixels."""
+    """Largest image in megapixels."""
     force: Overwrite = False
     """Localize in an inconsistent map."""
 
@@ -178,9 +181,9 @@ class Serve(ReadingMap, Deciding, Common):
             raise OptionError(
                 f"--host {self.host}: reachable from other machines; give --token-file"
             )
-        options = self.options()  # wrong ones are refused before the map is read
+        options = self.options()  # rejects invalid options before the map is read
         with bind(self.host, self.port) as bound:
-            kapture_map = _consistent_map(self, self.map)
+            kapture_map = _open_consistent_map(self, self.map)
             localizer = prepared_localizer(kapture_map, options)
             host = f"[{self.host}]" if ":" in self.host else self.host
             where = f"http://{host}:{bound.getsockname()[1]}/"
@@ -205,8 +208,8 @@ def _read_token(path: Path) -> str:
     return token
 
 
-def _consistent_map(command: Localize | Serve, path: Path) -> KaptureMap:
-    """Open a map or COLMAP model; raise DataError for an inconsistent map, or warn if forced."""
+def _open_consistent_map(command: Localize | Serve, path: Path) -> KaptureMap:
+    """Open a map or COLMAP model; raise DataError if it is inconsistent, or warn if forced."""
     kapture_map = command.open_map(command.opened_map(path, force=command.force))
     if fault := kapture_map.fault():
         message = f"{fault}; the poses would be wrong (--force localizes anyway)"

@@ -38,9 +38,9 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import (
     DEFAULT_PRESET,
-    assigned,
     options_of_preset,
     options_with,
+    parse_assignments,
 )
 from megloc_kapture.plugin_loading import load_chosen, load_plugin, plugin_class
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
@@ -396,7 +396,7 @@ class OutsideStage(Working):
     """Change an option of the stage: key=value; may be repeated."""
 
     def run(self) -> None:
-        stage = load_plugin(STAGES, self.stage, assigned(self.set))
+        stage = load_plugin(STAGES, self.stage, parse_assignments(self.set))
         check_option(
             (self.workspace / "stages").is_dir(),
             f"{self.workspace} is not a workspace of megloc eval",
@@ -467,7 +467,7 @@ class Preprocess(Computing, Working):
             "user_masks": self.user_masks,
         }
         flags = {"max_size_px": self.resize, "undistort": self.undistort, "masks": masks}
-        given = assigned(self.set)
+        given = parse_assignments(self.set)
         given |= given.pop("preprocessing", {})  # as the other stages name these options
         return options_with(PreprocessingOptions, given, flags)
 

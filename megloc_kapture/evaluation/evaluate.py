@@ -98,7 +98,7 @@ def evaluate(
     align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
     """
     check_option(align in get_args(Align), f"align is {align!r}; give none, se3 or sim3")
-    benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
+    benchmark = benchmark_near([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
     given = () if thresholds is None else thresholds
     bounds = [_threshold(each) for each in ([given] if isinstance(given, str) else given)]
@@ -120,13 +120,13 @@ def _threshold(given: Any) -> Threshold:
     return Threshold.parse(given if isinstance(given, str) else ", ".join(map(str, given)))
 
 
-def benchmark_beside(
-    beside: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
+def benchmark_near(
+    paths: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
 ) -> SideTables:
     """Return the benchmark of ``side_tables``, or of the first path that is in a workspace."""
     if side_tables is not None:
         check_tables(side_tables)
-    for path in beside:
+    for path in paths:
         if isinstance(path, Path | str):
             side_tables = side_tables or side_tables_near(path)
     return benchmark_of(side_tables, dataset)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.evaluation.evaluate import (
     Localized,
-    benchmark_beside,
+    benchmark_near,
     evaluate_results,
     results_without_truth,
 )
@@ -102,7 +102,7 @@ def write_view(
 def _evaluate(
     result: Localized, truth: Path | str | Poses | None, folder: KaptureFolder
 ) -> Evaluation:
-    benchmark = benchmark_beside([truth, result])
+    benchmark = benchmark_near([truth, result])
     labels = [""] if isinstance(result, Mapping) else None
     if truth is None:
         reported = results_without_truth([result], benchmark, mapping=folder.root, labels=labels)

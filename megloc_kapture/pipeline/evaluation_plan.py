@@ -28,7 +28,7 @@ from megloc_kapture.pipeline.datasets import (
     with_model,
 )
 from megloc_kapture.pipeline.map_making import MAP_STAGES
-from megloc_kapture.pipeline.presets import assigned, check_weights, options_of_preset
+from megloc_kapture.pipeline.presets import check_weights, options_of_preset, parse_assignments
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES, RenderedDataset
@@ -152,7 +152,7 @@ def choose_run(
     )
     usual = options_of_preset(preset, changes=changes)
     options = options_of_preset(preset, changes=changes, assignments=assignments)
-    is_asked = "by" in assigned(assignments).get("mapping_pairs", {})
+    is_asked = "by" in parse_assignments(assignments).get("mapping_pairs", {})
     others = tuple(method for method in options.mapping_pairs.by if method != "covisibility")
     if options.pairs_by_points() and others and not is_asked and not has_model(source):
         _log.warning("no reference model in this data: no map pairs by co-visibility")
@@ -212,7 +212,7 @@ def explain(options: PipelineOptions) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def explained(rows: Sequence[Mapping[str, Any]]) -> str:
+def explanation_table(rows: Sequence[Mapping[str, Any]]) -> str:
     width = max(len(row["name"]) for row in rows)
     return "\n".join(
         f"{row['name']:{width}s}  {'on' if row['on'] else 'off':3s}  {row['why']}" for row in rows

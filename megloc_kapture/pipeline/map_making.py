@@ -213,7 +213,7 @@ def _structure_options(
             f"--scale takes {GPS}, or two photographs and the metres between them, got "
             f"{' '.join(scale)!r}"
         )
-    known = {"known_cameras": photographs.known_cameras(), "distance": distance, "gps": gps}
+    known = {"known_cameras": photographs.has_known_cameras(), "distance": distance, "gps": gps}
     return options_with(StructureOptions, {"mapper": mapper, **known})
 
 

@@ -62,16 +62,16 @@ _MEGLOC = PipelineOptions(
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
 )
-# all weights of the modern presets have a free licence: docs/experiments/presets.md
+# all weights of the modern presets permit commercial use: docs/experiments/presets.md
 _ALIKED = LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05})
 _LIGHTGLUE = PluginChoice(name="lightglue", options={"weights": "aliked_lightglue"})
 _MODERN = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(_ALIKED,),
-    # only weak pairs of map images, so that queries cost no more
+    # rematches only map pairs with few matches; queries take no longer
     second_matching=SecondMatchingOptions(matcher=_LIGHTGLUE, min_matches=100, queries=False),
 )
-# the weights must be downloaded
+# needs 1 GB of weights, most of it MegaLoc
 _MODERN_LARGE = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(_ALIKED.model_copy(update={"matching": _LIGHTGLUE}),),
@@ -110,11 +110,11 @@ def options_of_preset(
 ) -> PipelineOptions:
     """Return a preset's options, modified by ``changes`` (nested tables) and ``assignments``.
 
-    Assignments are ``key.key=value`` texts or map ``key.key`` to values; they take precedence.
+    Assignments are ``key.key=value`` strings or map ``key.key`` to values; they are applied last.
     """
     if preset not in PRESETS:
         raise OptionError(f"unknown preset {preset!r}; {suggestion(preset, PRESETS)}")
-    return _changed(PRESETS[preset], *changes, assigned(assignments))
+    return _apply_changes(PRESETS[preset], *changes, parse_assignments(assignments))
 
 
 def options_with(
@@ -122,10 +122,10 @@ def options_with(
     assignments: Sequence[str] | Mapping[str, Any],
     changes: Mapping[str, Any] | None = None,
 ) -> OptionsT:
-    return _changed(model(), assigned(changes or {}), assigned(assignments))
+    return _apply_changes(model(), parse_assignments(changes or {}), parse_assignments(assignments))
 
 
-def _changed(options: OptionsT, *changes: dict[str, Any]) -> OptionsT:
+def _apply_changes(options: OptionsT, *changes: dict[str, Any]) -> OptionsT:
     model, tree = type(options), options.model_dump()
     for change in changes:
         _merge(tree, change)
@@ -135,17 +135,17 @@ def _changed(options: OptionsT, *changes: dict[str, Any]) -> OptionsT:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise OptionError(f"unknown option {where}; {_similar(where, model)}") from error
+            raise OptionError(f"unknown option {where}; {_suggestion(where, model)}") from error
         raise OptionError(f"option {option_fault(error, model)}") from error
 
 
-def assigned(
+def parse_assignments(
     assignments: Sequence[str] | Mapping[str, Any], *, flag: str = "--set"
 ) -> dict[str, Any]:
-    """Convert ``key.key=value`` texts, or a mapping of ``key.key`` to values, to nested tables."""
+    """Convert ``key.key=value`` strings, or a mapping from ``key.key``, to nested tables."""
     tree: dict[str, Any] = {}
-    typed = partial(_typed, flag=flag)
-    pairs = assignments.items() if isinstance(assignments, Mapping) else map(typed, assignments)
+    parse = partial(_parse_assignment, flag=flag)
+    pairs = assignments.items() if isinstance(assignments, Mapping) else map(parse, assignments)
     for key, value in pairs:
         nested: Any = value
         for part in reversed(key.split(".")):
@@ -154,11 +154,11 @@ def assigned(
     return tree
 
 
-def _typed(assignment: str, flag: str) -> tuple[str, Any]:
+def _parse_assignment(assignment: str, flag: str) -> tuple[str, Any]:
     key, equals, text = assignment.partition("=")
     check_option(equals and key, f"{flag} takes key=value, got {assignment!r}")
     key, text = key.strip(), text.strip()
-    if text in ("None", "null"):  # not "none": for some options it is a choice; Options parses it
+    if text in ("None", "null"):  # "none" stays text, as it is a choice of some options
         return key, None
     try:
         return key, tomllib.loads(f"value = {text}")["value"]
@@ -166,7 +166,7 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
         return key, text
 
 
-def _similar(path: str, root: type[Options]) -> str:
+def _suggestion(path: str, root: type[Options]) -> str:
     keys = [key for key, _, _ in options_of(root())]
     elsewhere = [key for key in keys if key.endswith(f".{path.rpartition('.')[2]}")]
     steps = {key.rpartition(".")[0] for key in keys} - {""}
@@ -175,7 +175,7 @@ def _similar(path: str, root: type[Options]) -> str:
 
 
 def options_of(options: Options, prefix: str = "") -> Iterator[tuple[str, Any, FieldInfo]]:
-    """Yield key, value and field of all options, also of nested ones."""
+    """Yield key, value and field of all options, including nested ones."""
     for name, field in type(options).model_fields.items():
         value = getattr(options, name)
         if isinstance(value, Options) and not isinstance(value, PluginChoice):
@@ -190,15 +190,15 @@ def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
         if isinstance(value, dict) and isinstance(present, dict):
             _merge(present, value)
         elif isinstance(value, dict) and isinstance(present, list | tuple | str):
-            tree[key] = _merged_choices(key, listed(present), value)
+            tree[key] = _merge_choices(key, listed(present), value)
         else:
             tree[key] = value
 
 
-def _merged_choices(
+def _merge_choices(
     key: str, choices: Sequence[Any], changes: dict[str, Any]
 ) -> list[dict[str, Any]]:
-    """Apply changes to the only plugin of a list, or to named ones, as in
+    """Apply changes to the only plugin in a list, or to the plugins that the keys name, as in
     ``local_features.aliked.options.max_keypoints``.
     """
     merged = [
@@ -218,7 +218,7 @@ def _merged_choices(
         _merge(merged[0], changes)
     else:
         raise OptionError(
-            f"option {key}.{min(changes)}: there are several, choose one of: "
+            f"option {key}.{min(changes)}: {key} has several plugins; choose one of: "
             f"{', '.join(f'{key}.{name}' for name in named)}"
         )
     return merged
@@ -226,24 +226,25 @@ def _merged_choices(
 
 def check_weights(options: PipelineOptions) -> None:
     """Raise MissingWeightsError, with the download command, if a plugin lacks its weights."""
-    if (error := _missing(options)) is None:
+    if (error := _missing_weights(options)) is None:
         return
-    of_presets = {name: _missing(preset) for name, preset in PRESETS.items()}
-    fetching = {
-        name: lacks.names
-        for name, lacks in of_presets.items()
-        if lacks is not None and set(lacks.names) <= set(error.names)
+    missing_of = {name: _missing_weights(preset) for name, preset in PRESETS.items()}
+    # presets whose missing weights are all needed
+    weights_of = {
+        name: missing.names
+        for name, missing in missing_of.items()
+        if missing is not None and set(missing.names) <= set(error.names)
     }
-    if fetching and len(error.names) > 1:
-        preset = max(fetching, key=lambda name: len(fetching[name]))
-        free = all(lookup(name).commercial for name in fetching[preset])
+    if weights_of and len(error.names) > 1:
+        preset = max(weights_of, key=lambda name: len(weights_of[name]))
+        free = all(lookup(name).commercial for name in weights_of[preset])
         command = f"megloc weights fetch --preset {preset}{'' if free else ' --accept-licence'}"
         message = f"{error}\nfetch all weights of preset {preset} with: {command}"
         error = MissingWeightsError(message, names=error.names)
     raise error
 
 
-def _missing(options: PipelineOptions) -> MissingWeightsError | None:
+def _missing_weights(options: PipelineOptions) -> MissingWeightsError | None:
     features = options.local_features
     matchers = [choice.matching or options.matching for choice in features]
     second = [options.second_matcher(of_queries=of_queries) for of_queries in (False, True)]

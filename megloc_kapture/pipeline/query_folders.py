@@ -57,7 +57,7 @@ from megloc_kapture.values import Camera, LocalFeatures, RigidTransform, check_c
 _log = logging.getLogger(__name__)
 
 FRAMES_EVERY = 30
-# number of queries whose keypoints are compared with the image size, and of keypoints each needs
+# number of queries whose keypoints are compared with the image size
 _QUERIES_COMPARED = 10
 _LIST_SUFFIXES = (".txt", ".csv")
 _NOTHING = np.zeros((0, 2), np.float32)
@@ -67,8 +67,8 @@ _NO_FEATURES = LocalFeatures(_NOTHING, _NOTHING[:, 0], _NOTHING)
 class Queries(ABC):
     """Query images, read one at a time.
 
-    ``unreadable`` maps names of unusable images to the reason, and ``faults`` those of images with
-    unusable features. ``faults`` is filled when queries are read.
+    ``unreadable`` maps the names of unusable images to the reason. ``faults`` does so for images
+    with unusable features; it is filled when queries are read.
     """
 
     def __init__(self) -> None:
@@ -76,21 +76,21 @@ class Queries(ABC):
         self.unreadable: dict[str, str] = {}
         self.faults: dict[str, str] = {}
 
-    def check(self) -> None:  # noqa: B027  # Photographs checks in its constructor
+    def check(self) -> None:  # noqa: B027  # the constructor of Photographs has checked already
         """Check everything that can be checked without reading features or pixels."""
 
-    def lacking(self, local_type: str) -> str | None:
-        """Return the first image without features for a type, or None."""
+    def first_without_features(self, local_type: str) -> str | None:
+        """Return the first image without features of a type, or None if all have them."""
         return next(iter(self.names), None)
 
-    def types_of_all(self) -> list[str]:
+    def shared_global_types(self) -> list[str]:
         """Return the global-feature types shared by all queries and the map."""
         return []
 
     def units(self, *, rigs: bool) -> list[scene.Unit]:
-        """Return (name, ``cam_from_rig``) of the images that are localized jointly, by unit.
+        """Return the units, the sets of images that are localized jointly.
 
-        A unit has the images of a rig at one timestamp, or a single image.
+        A unit lists (name, ``cam_from_rig``) of a rig's images at one timestamp, or of one image.
         """
         units = scene.query_units(self.data(), rigs=rigs)
         usable = (tuple(pair for pair in unit if pair[0] not in self.unreadable) for unit in units)
@@ -102,11 +102,11 @@ class Queries(ABC):
 
     @abstractmethod
     def data(self) -> KaptureData:
-        """Return sensors, rigs and records; cameras have the input's pixel origin."""
+        """Return sensors, rigs and records; the cameras keep the pixel origin of the input."""
 
     @abstractmethod
     def write_images(self, output: Path) -> None:
-        """Write the images into a kapture folder, as links if unchanged."""
+        """Write the images into a kapture folder; unchanged images are linked."""
 
 
 class KaptureQueries(Queries):
@@ -120,15 +120,15 @@ class KaptureQueries(Queries):
         super().__init__()
         self._folder, self._map = folder, kapture_map
         self.names = folder.read().image_names()
-        brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
+        types = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
         self._local: dict[str, MapKeypoints] = {}
         for stored in kapture_map.folder.types("keypoints"):
             base = base_type(stored)
             plain = plain_name(base)
-            serving = [name for name in brought if plain_name(base_type(name)) == plain]
-            if serving and base not in self._local:
-                # features of a plain type serve its guided-pyramid type, and vice versa
-                name = min(serving, key=lambda name: (name != base, name != base_type(name), name))
+            usable = [name for name in types if plain_name(base_type(name)) == plain]
+            if usable and base not in self._local:
+                # a type and its guided-pyramid type can be matched with each other
+                name = min(usable, key=lambda name: (name != base, name != base_type(name), name))
                 of_map = kapture_map.keypoints_of(stored)
                 self._local[base] = replace(of_map, folder=folder, name=name)
         self._data = folder.read() if self._local else with_cameras_of_images(folder)
@@ -138,16 +138,16 @@ class KaptureQueries(Queries):
             if name in folder.types("global_features")
         }
 
-    def lacking(self, local_type: str) -> str | None:
+    def first_without_features(self, local_type: str) -> str | None:
         local = self._local.get(base_type(local_type))
         return next((name for name in self.names if local is None or name not in local), None)
 
     def check(self) -> None:
         self._map.folder.check_features_apart(self._folder)
         require(self.names, "there are no query images", path=self._folder.root)
-        self._check_widths()
+        self._check_dimensions()
         for local in self._local.values():
-            self._warn_of_other_size(local)
+            self._warn_of_image_size(local)
         errors = []
         for name in self.names:
             if any(name in local for local in self._local.values()):
@@ -191,15 +191,15 @@ class KaptureQueries(Queries):
             camera = read_photo(self._folder.image_path(name)).camera
         except DataError:  # the query can be localized from its features
             return guessed_camera(width, height)
-        # keypoints are in pixels of the sensor's image size
-        is_other = min(width, height) > 0 and (width, height) != (camera.width, camera.height)
-        brings = any(name in local for local in self._local.values())
-        return scaled_camera(camera, width, height) if is_other and brings else camera
+        # stored keypoints are in pixels of the sensor's image size
+        differs = min(width, height) > 0 and (width, height) != (camera.width, camera.height)
+        has_features = any(name in local for local in self._local.values())
+        return scaled_camera(camera, width, height) if differs and has_features else camera
 
     def write_images(self, output: Path) -> None:
         link_images(self._folder.root, output)
 
-    def _check_widths(self) -> None:
+    def _check_dimensions(self) -> None:
         pairs = [
             (vectors, self._map.folder.global_features(name))
             for name, vectors in self._globals.items()
@@ -212,19 +212,19 @@ class KaptureQueries(Queries):
         for reader, other in pairs:
             require(
                 reader.config.dsize == other.config.dsize,
-                f"{reader.kind} of type {reader.type_name!r} have {reader.config.dsize} values, "
-                f"the map's {other.config.dsize}",
+                f"{reader.kind} of type {reader.type_name!r} have dimension {reader.config.dsize}, "
+                f"those of the map {other.config.dsize}; extract both with the same network",
                 path=self._folder.root,
             )
 
-    def _warn_of_other_size(self, local: MapKeypoints) -> None:
+    def _warn_of_image_size(self, local: MapKeypoints) -> None:
         spans = []
         for name in [name for name in self.names if name in local][:_QUERIES_COMPARED]:
             with suppress(DataError):  # a broken file fails only its own query
                 spans.append((local.keypoints_px(name), self._sensor(name).params[1:3]))
         warn_of_other_size(spans, local.name, self._folder.root)
 
-    def types_of_all(self) -> list[str]:
+    def shared_global_types(self) -> list[str]:
         return [
             name
             for name, vectors in self._globals.items()
@@ -239,19 +239,20 @@ class KaptureQueries(Queries):
                 for base, stored in self._local.items()
                 if name in stored
             }
-            of_image = {
+            global_features = {
                 t: reader.read(name) for t, reader in self._globals.items() if name in reader
             }
         except DataError as error:
             self.faults[name] = str(error)
-            # no extraction either, as without candidates the features do not matter
-            features, of_image, candidates = dict.fromkeys(self._local, _NO_FEATURES), {}, ()
+            # no candidates, so that the query fails; empty features, so that none are extracted
+            features = dict.fromkeys(self._local, _NO_FEATURES)
+            global_features, candidates = {}, ()
         return Query(
             camera=self._camera(name),
             image=self._folder.image_path(name),
             name=name,
             features=features,
-            global_features=of_image,
+            global_features=global_features,
             prior=self._priors[name] if name in self._map.tables.priors else None,
             candidates=candidates,
             mask=mask_path(self._folder, name),
@@ -278,8 +279,8 @@ def _stored_features(stored: MapKeypoints, image: str) -> LocalFeatures:
 class Photographs(Queries):
     """Photographs and videos, as queries or as input for a map.
 
-    Without a given camera, images are turned upright by their EXIF orientation, and the camera
-    describes the upright image. Its focal length comes from EXIF or a guess, and is always
+    Without a given camera, images are rotated upright by their EXIF orientation, and the camera
+    describes the upright image. Its focal length starts from EXIF or a guess, and is always
     estimated with the pose. A given camera describes the stored pixels, and is scaled to images of
     another size but the same aspect ratio. Photographs of the same make, model, size and focal
     length share a camera, as do the frames of a video.
@@ -310,7 +311,7 @@ class Photographs(Queries):
                 check_camera(each)
         check_option(
             all(isinstance(path, str | Path) for path in paths),
-            "photographs are given as files or folders; localize arrays one at a time",
+            "give photographs as files or folders; only localize() takes arrays, one at a time",
         )
         roots = [Path(path) for path in paths]
         files = _named_files(roots)
@@ -334,15 +335,15 @@ class Photographs(Queries):
         warn_of_scaled(roots[0], self._scaled)
         if self.names and len(self.without_row) == len(self._photos) + len(self.unreadable):
             raise OptionError(
-                f"the list of cameras names none of the images, for example {self.names[0]}: the "
-                "first field of each row is an image name"
+                f"the list of cameras contains none of the images, for example {self.names[0]}; "
+                "the first field of each row must be the name of an image"
             )
         if self.without_row:
             shown, more = ", ".join(self.without_row[:5]), ", ..." if self.without_row[5:] else ""
             message = "%d images are not in the list of cameras; their cameras are estimated: %s%s"
             _log.warning(message, len(self.without_row), shown, more)
 
-    def known_cameras(self) -> bool:
+    def has_known_cameras(self) -> bool:
         return all(photo.camera.focal_deviation == 0 for photo in self._photos.values())
 
     def query(self, name: str) -> Query:
@@ -372,22 +373,22 @@ class Photographs(Queries):
     def write_images(self, output: Path) -> None:
         for name, photo in self._photos.items():
             path = self._paths[name]
-            place = Path(output) / "sensors" / "records_data" / name
-            place.parent.mkdir(parents=True, exist_ok=True)
+            target = Path(output) / "sensors" / "records_data" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
             if self._is_frame(name):
-                hard_link(path, place)
+                hard_link(path, target)
             elif photo.orientation == 1:
-                link_file(path, place)
+                link_file(path, target)
             else:
                 try:
                     pixels = read_image_rgb(path)
-                except DataError:  # as for other links, readers report the reason
-                    link_file(path, place)
+                except DataError:  # the stage that reads the linked image reports the error
+                    link_file(path, target)
                 else:
-                    write_image(place, turned_upright(pixels, photo.orientation))
+                    write_image(target, turned_upright(pixels, photo.orientation))
 
     def _is_frame(self, name: str) -> bool:
-        """Return whether an image is a frame of a video, in the temporary folder of frames."""
+        """Return whether an image is a video frame, stored in the temporary folder."""
         return self._frames is not None and self._paths[name].is_relative_to(self._frames.name)
 
     def _add(self, name: str, path: Path) -> None:
@@ -444,7 +445,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         for name, file in files.items():
             if by_name.get(name, file) != file:
                 raise DataError(
-                    f"{by_name[name]} would have the same name; give a common parent folder",
+                    f"{by_name[name]} would have the same image name; give a common parent folder",
                     path=file,
                 )
             _check_name(name, file)
@@ -456,7 +457,7 @@ def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
     data = folder.read()
     require(
         not data.poses(),
-        "a kapture folder of images with poses: `megloc triangulate` makes a map of them, "
+        "is a kapture folder with poses: `megloc triangulate` makes a map of its images, "
         "`megloc localize --query` localizes them",
         path=folder.root,
     )
@@ -467,17 +468,17 @@ def _images_below(folder: Path) -> list[Path]:
     paths, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
-        written = (here / MARKER).is_file() or is_kapture(here)
-        if real in seen or (written and here != folder):  # link loop, or kapture or megloc output
+        is_output = (here / MARKER).is_file() or is_kapture(here)
+        if real in seen or (is_output and here != folder):  # visited already, or not photographs
             folders.clear()
             continue
         seen.add(real)
         # visit real folders first, so that links to them are the duplicates
-        shown = (name for name in folders if not name.startswith("."))
-        folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
+        visible = (name for name in folders if not name.startswith("."))
+        folders[:] = sorted(visible, key=lambda name: ((here / name).is_symlink(), name))
         paths += [here / name for name in files if not name.startswith(".")]
-    named = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
-    return sorted(path for path in paths if path.suffix.lower() in named or is_image(path))
+    suffixes = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
+    return sorted(path for path in paths if path.suffix.lower() in suffixes or is_image(path))
 
 
 def _check_name(name: str, path: Path) -> None:

@@ -62,7 +62,7 @@ class Results(Mapping[str, Pose | Failure]):
         localizer.map.check()
         self.queries.check()
         for local in localizer.types:
-            if (lacking := self.queries.lacking(local.name)) is not None:
+            if (lacking := self.queries.first_without_features(local.name)) is not None:
                 local.required_extractor(f"image {lacking!r}")
         self._candidates = candidates
         self._units = self.queries.units(rigs=localizer.options.localization.rigs)

@@ -74,7 +74,7 @@ def test_a_foreign_map_with_its_features_needs_no_weights(
     result = tmp_path / "localized"
     done = megloc(*localize(foreign, result), "--preset", preset)
     assert done.out.startswith("4 of 4 queries localized in ")
-    assert f"localizing with {local_type}" in done.err
+    assert f"localized with {local_type}" in done.err
     _, median_m, median_deg = medians(result, foreign / "query_gt")
     assert median_m <= 0.010 and median_deg <= (0.16 if given == "virtual_gallery" else 0.05)
     # pairs with few matches would be extracted again, which needs the weights
@@ -145,7 +145,7 @@ def test_without_any_usable_image_the_command_stops(
     (tmp_path / "phone").mkdir()
     (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"")
     command = ("localize", "-i", finished / "map", "--images", tmp_path / "phone")
-    megloc(*command).refused(r"no photograph can be used, the first is IMG_1\.HEIC: \.HEIC cannot")
+    megloc(*command).refused(r"no photograph can be used; the first is IMG_1\.HEIC: \.HEIC cannot")
 
 
 def test_without_any_localized_query_a_warning_is_printed_and_a_fallback_marked(

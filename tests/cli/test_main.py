@@ -34,7 +34,7 @@ WRONG_ARGUMENTS = {
     "not a choice": (["eval", "-v", "loud"], "invalid choice 'loud'"),
     "camera of a kapture folder": (
         ["localize", "-i", "map", "--query", "query", "--every", "2"],
-        "--camera and --every are for --images",
+        "--camera and --every apply to --images",
     ),
     "value out of range": (["serve", "map", "--max-mb", "0"], "--max-mb 0.0: must be positive"),
 }

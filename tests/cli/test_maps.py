@@ -285,5 +285,5 @@ def test_a_model_of_surveyed_photographs_is_localized_in(
     assert done.status == 0, done
     places = ("-i", tmp_path / "map", "--query", scene / "query", "-o", tmp_path / "localized")
     done = megloc("localize", *places)
-    assert "localizing with sift" in done.err
+    assert "localized with sift" in done.err
     check(tmp_path / "localized", scene)

@@ -32,15 +32,15 @@ from megloc_kapture.pipeline.evaluation_plan import (
     Run,
     choose_run,
     explain,
-    explained,
+    explanation_table,
     plan_evaluation,
 )
 from megloc_kapture.pipeline.presets import (
     PRESETS,
     PipelineOptions,
-    assigned,
     options_of,
     options_of_preset,
+    parse_assignments,
 )
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS
 from megloc_kapture.values import Camera, RigidTransform
@@ -265,7 +265,7 @@ def test_none_disables_optional_steps() -> None:
     for key, _, field in options_of(PipelineOptions()):
         kind = str(field.annotation)
         if "None" in kind or "'none'" in kind:
-            options = options_of_preset(changes=[assigned([f"{key}=none"])])
+            options = options_of_preset(changes=[parse_assignments([f"{key}=none"])])
             found = attrgetter(key)(options)
             (off if "None" in kind else chosen).add(key)
             assert found == (None if "None" in kind else "none"), key
@@ -409,7 +409,7 @@ def test_explain_runs_nothing_and_needs_no_data(
     with pytest.raises(SystemExit) as end:
         main(["eval", "synthetic-inloc", "--preset", "megloc", "--explain"])
     assert end.value.code == 0
-    expected = explained(explain(run_of("inloc", "megloc").options))
+    expected = explanation_table(explain(run_of("inloc", "megloc").options))
     assert capsys.readouterr().out.rstrip("\n") == expected
     assert list(tmp_path.iterdir()) == []
 

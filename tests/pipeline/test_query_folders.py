@@ -113,7 +113,7 @@ def test_unusable_files_and_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24")
     for paths, message in (
-        ([one, two], "same name"),
+        ([one, two], "same image name"),
         ([tmp_path / "nowhere"], "no such file"),
         ([tmp_path / "empty"], "no image or video"),
         ([tmp_path / "cameras.txt"], "if it lists cameras, give it with --camera"),
@@ -122,7 +122,7 @@ def test_unusable_files_and_folders_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DataError, match=message):
             Photographs(paths)
-    with pytest.raises(OptionError, match="localize arrays one at a time"):
+    with pytest.raises(OptionError, match=r"only localize\(\) takes arrays"):
         Photographs([np.zeros((8, 8, 3), np.uint8)])  # type: ignore[list-item]
     with pytest.raises(OptionError, match="no photographs are given"):
         Photographs([])
@@ -148,7 +148,7 @@ def test_a_list_has_the_camera_of_each_image(
     assert found["day/2 b.jpg"] == Camera("SIMPLE_RADIAL", 64, 48, (53, 32, 24, 0.1))
     assert photos.without_row == ["other/3.jpg"] and found["other/3.jpg"].focal_deviation > 0
     assert "1 images are not in the list of cameras" in caplog.text
-    assert not photos.known_cameras()
+    assert not photos.has_known_cameras()
     # the path distinguishes images of one name
     assert Photographs([tmp_path / "query" / "day"], cameras).query("1.jpg").camera.params[0] == 51
     with pytest.raises(OptionError, match=r"none of the images, for example 3\.jpg"):
@@ -159,7 +159,7 @@ def test_a_list_has_the_camera_of_each_image(
     # COLMAP's cameras.txt with one camera
     (tmp_path / "cameras.txt").write_text("# Camera list\n1 PINHOLE 64 48 50 50 32 24\n")
     photos = Photographs([tmp_path / "query"], read_cameras(tmp_path / "cameras.txt"))
-    assert photos.known_cameras() and photos.query("night/1.jpg").camera.params[0] == 50
+    assert photos.has_known_cameras() and photos.query("night/1.jpg").camera.params[0] == 50
 
 
 def test_photographs_of_a_kapture_folder_have_its_cameras(tmp_path: Path) -> None:
@@ -211,8 +211,8 @@ def test_features_with_and_without_pyramid_are_interchangeable(
     folder, opened = KaptureFolder(query, features_dirs=[features]), KaptureMap.open(place)
     assert list(opened.keypoints) == [type_of_map]
     queries = KaptureQueries(folder, opened)
-    assert queries.lacking(type_of_map) is None
-    assert queries.lacking("superpoint") == queries.names[0]
+    assert queries.first_without_features(type_of_map) is None
+    assert queries.first_without_features("superpoint") == queries.names[0]
     results = Results(Localizer(opened, options=options_of_preset(assignments=[FEW])), folder)
     assert all(results.values())
 
@@ -306,4 +306,4 @@ def test_other_spellings_of_a_type_are_recognised(
     source = workspace / "local_features" / "rootsift"
     shutil.copytree(source, tmp_path / "features" / "local_features" / "RootSIFT")
     folder = KaptureFolder(folder.root, features_dirs=[tmp_path / "features"])
-    assert KaptureQueries(folder, opened).lacking("rootsift") is None
+    assert KaptureQueries(folder, opened).first_without_features("rootsift") is None
