@@ -77,7 +77,7 @@ class Queries(ABC):
         self.faults: dict[str, str] = {}
 
     def check(self) -> None:  # noqa: B027  # the constructor of Photographs has checked already
-        """Check everything that can be checked without reading features or pixels."""
+        """Check images and cameras; move unusable images from ``names`` to ``unreadable``."""
 
     def first_without_features(self, local_type: str) -> str | None:
         """Return the first image without features of a type, or None if all have them."""

@@ -130,12 +130,12 @@ class MapSelection:
 
     def observations(self) -> dict[str, Observations]:
         """Return the kept observations by type, with renumbered points."""
-        number = np.cumsum(self.kept_points) - 1
+        new_ids = np.cumsum(self.kept_points) - 1
         parts = np.split(self.kept, np.cumsum(self._sizes)[:-1]) if self._sizes else []
         return {
             name: replace(
                 seen,
-                point_ids=number[seen.point_ids[part]],
+                point_ids=new_ids[seen.point_ids[part]],
                 image_ids=seen.image_ids[part],
                 keypoint_ids=seen.keypoint_ids[part],
             )
@@ -223,8 +223,8 @@ def _verify_depth(
         return
     covariances = selection.covariances()
     kept, point_ids = selection.kept, selection.point_ids
-    once = np.bincount(point_ids[kept], minlength=len(selection.xyz))[point_ids] == 1
-    lifted = kept & once & np.isin(selection.image_ids, list(with_depth))
+    seen_once = np.bincount(point_ids[kept], minlength=len(selection.xyz))[point_ids] == 1
+    lifted = kept & seen_once & np.isin(selection.image_ids, list(with_depth))
     triangulated = np.flatnonzero(kept & ~lifted)
     observing = selection.image_ids[triangulated]
     rows_of = [
