@@ -34,6 +34,7 @@ from megloc_kapture.nets.score_maps import (
 )
 from megloc_kapture.values import LocalFeatures
 
+_NMS_RADIUS = 2  # pixels, as published
 _TEMPERATURE = 0.1  # softmax temperature of the sub-pixel position, as in training
 _MULTIPLE = 32
 # image rows per strip in the score head's first layer; a strip of two rows fits the CPU's cache
@@ -47,7 +48,6 @@ class AlikedOptions(LocalNetworkOptions):
         default="aliked-n16",
         description="aliked-t16 (64-d), aliked-n16, aliked-n16rot, aliked-n32, or a file",
     )
-    nms_radius: int = Field(default=2, gt=0, description="pixels")
     threshold: float = Field(default=0.2, ge=0, lt=1, description="smallest score of a keypoint")
 
 
@@ -72,13 +72,13 @@ class Aliked(LocalNetwork[AlikedOptions]):
     def _selected(
         self, net: AlikedNet, maps: AlikedMaps, mask: NDArray[np.bool_] | None
     ) -> LocalFeatures:
-        options, scores = self.options, maps.scores
+        scores = maps.scores
         pixels, _ = select_pixels(
-            suppress_non_maxima(scores, options.nms_radius),
-            threshold=options.threshold,
-            border=options.nms_radius,
+            suppress_non_maxima(scores, _NMS_RADIUS),
+            threshold=self.options.threshold,
+            border=_NMS_RADIUS,
         )
-        xy = soft_argmax(scores, pixels, options.nms_radius, _TEMPERATURE)
+        xy = soft_argmax(scores, pixels, _NMS_RADIUS, _TEMPERATURE)
         height, width = scores.shape
         read = read_bilinear(scores.reshape(-1, 1), xy[:, 1], xy[:, 0], (height, width))
         # the first pixel's centre is (0, 0) in the network, (0.5, 0.5) in COLMAP

@@ -97,10 +97,6 @@ def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
 
 class DiskOptions(LocalNetworkOptions):
     weights: str = Field(default="disk", description="name in the registry, or a file")
-    nms_window_px: int = Field(
-        default=5, ge=1, description="side of the non-maximum suppression window, odd"
-    )
-    threshold: float = Field(default=0.0, description="smallest score of a keypoint, a logit")
 
 
 class Disk(LocalNetwork[DiskOptions]):
@@ -114,13 +110,10 @@ class Disk(LocalNetwork[DiskOptions]):
         super().__init__(options)
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
-        options = self.options
         network, device = self.network(load_disk)
         batch = torch.cat([image_tensor(image, device) for image in images])
-        with inference(device, options.half_precision):
-            detections = network(
-                batch, None, options.nms_window_px, options.threshold, pad_if_not_divisible=True
-            )
+        with inference(device, self.options.half_precision):
+            detections = network(batch, pad_if_not_divisible=True)
         levels = [
             _level(found.keypoints, found.detection_scores, found.descriptors)
             for found in detections

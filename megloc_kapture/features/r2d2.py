@@ -23,7 +23,6 @@ from megloc_kapture.features.network import (
     LocalNetwork,
     LocalNetworkOptions,
     Masks,
-    in_image_px,
 )
 from megloc_kapture.nets.runtime import image_tensor, in_fast_layout, inference, load_strictly
 from megloc_kapture.nets.score_maps import window_maximum
@@ -36,6 +35,7 @@ _LAYERS = ((3, 1, 1), (3, 1, 1), (3, 2, 1), (3, 2, 2), (3, 4, 2), (3, 4, 4), (2,
 _STEPS_PER_OCTAVE = 4
 _TOLERANCE = 0.001  # for comparing scales with their limits, as in the authors' code
 _DEFAULT_WEIGHTS = "r2d2_WASF_N16"
+_MIN_RELIABILITY = _MIN_REPEATABILITY = 0.7  # of keypoints, as in the authors' code
 _PATCH_PX = 32.0  # scale of keypoints at full resolution, as in the authors' code
 
 
@@ -43,15 +43,10 @@ class R2D2Options(LocalNetworkOptions):
     """Options of R2D2; defaults are the authors' values except for the number of keypoints."""
 
     weights: str = Field(default=_DEFAULT_WEIGHTS, description="name in the registry, or a file")
-    max_keypoints: int = Field(
-        default=1500, gt=0, description="number of best keypoints kept; the authors use 5000"
-    )
     min_size: int = Field(
         default=256, gt=0, description="smallest longer side of a reduced level, pixels"
     )
     max_size: int = Field(default=1024, gt=0, description="largest longer side of a level, pixels")
-    min_reliability: float = Field(default=0.7, ge=0, le=1)
-    min_repeatability: float = Field(default=0.7, ge=0, le=1)
 
     @model_validator(mode="after")
     def _levels_exist(self) -> R2D2Options:
@@ -80,6 +75,7 @@ class R2D2(LocalNetwork[R2D2Options]):
         # channels last is twice as fast on a CPU
         network, device = self.network(load_r2d2, channels_last=True)
         levels_of: list[list[Level]] = [[] for _ in images]
+        height, width = images[0].shape[:2]
         with inference(device, options.half_precision):
             levels = pyramid_levels(
                 torch.cat([image_tensor(image, device) for image in images]),
@@ -88,17 +84,19 @@ class R2D2(LocalNetwork[R2D2Options]):
             )
             for level in levels:
                 outputs = network(in_fast_layout(level))
-                scale = np.float32(_PATCH_PX * max(images[0].shape[:2]) / max(level.shape[-2:]))
+                scale = np.float32(_PATCH_PX * max(height, width) / max(level.shape[-2:]))
+                ratio = np.array([width / level.shape[-1], height / level.shape[-2]])
                 for of_image, features, reliability, repeatability in zip(
                     levels_of, *outputs, strict=True
                 ):
                     rows, columns = torch.nonzero(
                         (repeatability == window_maximum(repeatability, 1))
-                        & (repeatability >= options.min_repeatability)
-                        & (reliability >= options.min_reliability)
+                        & (repeatability >= _MIN_REPEATABILITY)
+                        & (reliability >= _MIN_RELIABILITY)
                     ).unbind(1)
                     xy = torch.stack([columns, rows], dim=1).cpu().numpy()
-                    xy_px = in_image_px(xy, level.shape[-2:], images[0].shape)
+                    # the first pixel's centre is (0, 0) in the level, (0.5, 0.5) in the image
+                    xy_px = ((xy + 0.5) * ratio).astype(np.float32)
                     scores = reliability[rows, columns] * repeatability[rows, columns]
                     descriptors = functional.normalize(features[:, rows, columns].float(), dim=0).T
                     table = np.column_stack([xy_px, np.full(len(xy_px), scale)])

@@ -26,8 +26,6 @@ class RootSiftOptions(BoundedOptions):
     contrast_threshold: float = Field(
         default=0.01, ge=0, description="smallest contrast of a keypoint (OpenCV's default is 0.04)"
     )
-    edge_threshold: float = Field(default=10.0, gt=0)
-    sigma_px: float = Field(default=1.6, gt=0, description="blur of the first octave")
 
 
 class RootSift:
@@ -52,12 +50,10 @@ class RootSift:
             # OpenCV applies a mask after the selection, so no limit is passed with a mask.
             # Describing only the unmasked keypoints in a second call would change descriptors:
             # if none of them is in the first octave, OpenCV builds another pyramid
-            options.max_keypoints if mask is None else 0,
-            3,
-            options.contrast_threshold,
-            options.edge_threshold,
-            options.sigma_px,
-            True,  # without precise upscaling, the first octave is shifted by a quarter pixel
+            nfeatures=options.max_keypoints if mask is None else 0,
+            contrastThreshold=options.contrast_threshold,
+            # without it, the first octave is shifted by a quarter pixel
+            enable_precise_upscale=True,
         )
         keypoints, descriptors = sift.detectAndCompute(gray, None)
         if descriptors is None:

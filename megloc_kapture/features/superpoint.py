@@ -31,6 +31,7 @@ from megloc_kapture.values import LocalFeatures
 
 _OFFICIAL_WEIGHTS = "superpoint_v1"
 DESCRIPTOR_SIZE = 256
+_BORDER_PX = 4  # border without keypoints, as in SuperGlue's code
 # image rows per strip, even; 64 is fastest: thinner strips overlap more, thicker ones do not fit
 # the CPU's caches
 _STRIP_ROWS = 64
@@ -39,10 +40,7 @@ _EPSILON = 1e-3  # of batch normalisation: TensorFlow's default, as in training
 
 
 class SuperPointOptions(LocalNetworkOptions):
-    """Options of SuperPoint.
-
-    NMS radius, threshold and border have the defaults of SuperGlue's published code.
-    """
+    """Options of SuperPoint; NMS radius and threshold default to those of SuperGlue's code."""
 
     weights: str = Field(
         default=_OFFICIAL_WEIGHTS,
@@ -54,9 +52,6 @@ class SuperPointOptions(LocalNetworkOptions):
     )
     threshold: float = Field(default=0.005, ge=0, lt=1, description="smallest score of a keypoint")
     nms_radius: int = Field(default=4, ge=0, description="in pixels; SuperGlue uses 3 outdoors")
-    remove_borders: int = Field(
-        default=4, ge=0, description="width of the border without keypoints, pixels"
-    )
     descriptor_sampling: DescriptorSampling = Field(
         default="official",
         description="official: as the authors of the weights do (Magic Leap's sampling is up to "
@@ -100,7 +95,7 @@ class SuperPoint(LocalNetwork[SuperPointOptions]):
             maxima = suppress_non_maxima(scores, options.nms_radius)
             for of_image, described, mask in zip(maxima, descriptors, masks, strict=True):
                 xy, of_pixels = select_pixels(
-                    of_image, threshold=options.threshold, border=options.remove_borders
+                    of_image, threshold=options.threshold, border=_BORDER_PX
                 )
                 # the first pixel's centre is (0, 0) in the network, (0.5, 0.5) in COLMAP
                 xy_px = xy.cpu().numpy().astype(np.float32) + np.float32(0.5)

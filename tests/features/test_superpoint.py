@@ -13,6 +13,7 @@ from torch.nn import functional
 from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.features import superpoint
 from megloc_kapture.features.superpoint import (
     SuperPoint,
     SuperPointNet,
@@ -52,9 +53,12 @@ def transformers_model(weights: Tensors, **options: int) -> SuperPointForKeypoin
 
 
 @pytest.mark.parametrize(("height", "width"), [(72, 96), (67, 90)])
-def test_keypoints_equal_transformers(superpoint_weights: Path, height: int, width: int) -> None:
+def test_keypoints_equal_transformers(
+    superpoint_weights: Path, height: int, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(superpoint, "_BORDER_PX", 0)
     image = texture(height, width, sigma_px=1.5)
-    result = extractor(superpoint_weights, remove_borders=0, max_keypoints=100).extract(image)
+    result = extractor(superpoint_weights, max_keypoints=100).extract(image)
     state = torch.load(superpoint_weights, weights_only=True)
     model = transformers_model(state, border_removal_distance=0, max_keypoints=100, nms_radius=4)
     with torch.inference_mode():
