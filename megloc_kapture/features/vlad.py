@@ -1,12 +1,8 @@
 """VLAD: aggregation of local descriptors into one global descriptor.
 
-Hard assignment follows Jegou et al., CVPR 2010. Soft assignment, as in MegLoc, follows
-equations 1 and 2 of NetVLAD (Arandjelovic et al., CVPR 2016)::
-
-    V(j, k) = sum_i a_k(x_i) (x_i(j) - c_k(j)),   a_k(x) = exp(-alpha |x - c_k|^2) / sum_k'(...)
-
-Intra-normalisation follows Arandjelovic and Zisserman, All about VLAD, CVPR 2013; joint whitening
-of several vocabularies follows Jegou and Chum, ECCV 2012.
+Each descriptor belongs to the nearest visual word (Jegou et al., CVPR 2010), as in MegLoc.
+Intra-normalisation follows Arandjelovic and Zisserman, All about VLAD, CVPR 2013; whitening follows
+Jegou and Chum, ECCV 2012.
 """
 
 from __future__ import annotations
@@ -14,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,43 +31,31 @@ _LEAST = 1e-9
 # whitening divides by standard deviations raised to this power, as AP-GeM does; with 1, as in Jegou
 # and Chum, all images of a small map are equally dissimilar
 WHITENING_POWER = 0.5
-# alpha of soft assignment, for unit-norm descriptors; 10 makes retrieval worse
-ALPHA = 30.0
 # number of descriptors that train a vocabulary, the same share of each image's; number of Lloyd
 # steps
 TRAINING_DESCRIPTORS, LLOYD_STEPS = 200_000, 20
 
 
 class VladOptions(Options):
-    num_clusters: int = Field(
-        default=128, gt=0, description="number of visual words per vocabulary"
-    )
-    vocabularies: int = Field(
-        default=1,
-        gt=0,
-        description="number of vocabularies with different seeds, whose vectors are concatenated",
-    )
+    num_clusters: int = Field(default=128, gt=0, description="number of visual words")
     dimensions: int | None = Field(
         default=None,
         gt=0,
         description="dimensions after PCA whitening, reduced to fewer than the number of map "
         "images; none: no whitening",
     )
-    assignment: Literal["hard", "soft"] = "hard"
     seed: int = Field(default=0, ge=0)
     local_type: str | None = Field(
         default=None, description="type of local features to aggregate; none: the run's first type"
     )
 
 
-def learn_whitening(
-    vectors: Float32, dimensions: int, power: float = 1.0
-) -> tuple[Float32, Float32]:
+def learn_whitening(vectors: Float32, dimensions: int) -> tuple[Float32, Float32]:
     """Learn mean and projection of a whitening from vectors float32 (N, D), which are overwritten.
 
-    Components are divided by their standard deviations raised to ``power``; a power below one
-    reduces the noise of the last components if images are few (Revaud et al., ICCV 2019).
-    ``dimensions`` is limited by the rank of the centred vectors, which is less than N.
+    Components are divided by their standard deviations raised to ``WHITENING_POWER``, which reduces
+    the noise of the last components if images are few (Revaud et al., ICCV 2019). ``dimensions`` is
+    limited by the rank of the centred vectors, which is less than N.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
@@ -90,8 +74,8 @@ def learn_whitening(
             "images, or no whitening"
         )
     variances, axes = variances[:kept], axes[:, :kept]
-    # combine the vectors into unit-length principal axes (D,), divided by deviation ** power
-    rows = (axes / np.sqrt(count * variances) / variances ** (power / 2)).T
+    # combine the vectors into unit-length principal axes (D,), divided by powers of the deviations
+    rows = (axes / np.sqrt(count * variances) / variances ** (WHITENING_POWER / 2)).T
     projection = np.empty((kept, size), dtype=np.float32)
     for start in range(0, size, _COLUMNS):
         part = vectors[:, start : start + _COLUMNS].astype(np.float64)
@@ -104,11 +88,11 @@ def learn_whitening(
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """Visual words of one or more vocabularies, and an optional PCA whitening of their vectors.
+    """Visual words, and an optional PCA whitening of the vectors.
 
     Attributes
     ----------
-    centres : float32 (V, K, D), the visual words of V vocabularies.
+    centres : float32 (K, D), the visual words.
     mean, projection : the whitening of a vector x is ``projection (x - mean)``, scaled to unit norm
         (Jegou and Chum, ECCV 2012); None for both means no whitening.
     """
@@ -122,7 +106,7 @@ class Vocabulary:
         return self.centres.size if self.projection is None else len(self.projection)
 
     def whiten(self, vector: Float32) -> Float32:
-        """Whiten one vector (V * K * D,), if there is a whitening; zero stays zero."""
+        """Whiten one vector (K * D,), if there is a whitening; zero stays zero."""
         if self.mean is None or self.projection is None:
             return vector
         if not vector.any():
@@ -144,7 +128,7 @@ def train_vlad(
     *,
     each: Each = map,
 ) -> Vocabulary:
-    """Train vocabularies, and optionally their whitening, on the images of a map.
+    """Train a vocabulary, and optionally a whitening, on the images of a map.
 
     ``length`` returns the number of an image's descriptors, ``read`` the descriptors themselves,
     (N, D). ``each`` maps a function over images, possibly in parallel.
@@ -168,17 +152,17 @@ def train_vlad(
         picks = np.linspace(0, len(described) - 1, most).round().astype(np.int64)
         described = [described[pick] for pick in picks]
     vectors = np.empty((len(described), vocabulary.size), dtype=np.float32)
-    describe = partial(_read_and_aggregate, read, vocabulary, options)
+    describe = partial(_read_and_aggregate, read, vocabulary)
     for row, vector in zip(vectors, each(describe, described), strict=True):
         row[:] = vector
-    whitening = learn_whitening(vectors, options.dimensions, WHITENING_POWER)
+    whitening = learn_whitening(vectors, options.dimensions)
     return Vocabulary(vocabulary.centres, *whitening)
 
 
 def _read_and_aggregate(
-    read: Callable[[str], NDArray[Any]], vocabulary: Vocabulary, options: VladOptions, image: str
+    read: Callable[[str], NDArray[Any]], vocabulary: Vocabulary, image: str
 ) -> Float32:
-    return aggregate(read(image), vocabulary, options)
+    return aggregate(read(image), vocabulary)
 
 
 def train_vocabulary(
@@ -193,13 +177,7 @@ def train_vocabulary(
         )
     if not np.isfinite(data).all():
         raise DataError("some of the map's descriptors are not finite")
-    return Vocabulary(
-        np.stack([_cluster(data, options, number) for number in range(options.vocabularies)])
-    )
-
-
-def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
-    rng = np.random.default_rng([options.seed, number])
+    rng = np.random.default_rng([options.seed, 0])
     centres = _plus_plus(data, options.num_clusters, rng)
     previous = np.full(len(data), -1, dtype=np.int64)
     for _ in range(LLOYD_STEPS):
@@ -213,7 +191,7 @@ def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
         centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
         for k in np.flatnonzero(~filled):  # an empty cluster restarts at a random descriptor
             centres[k] = data[rng.integers(len(data))]
-    return centres
+    return Vocabulary(centres)
 
 
 def _plus_plus(data: Float32, num_clusters: int, rng: np.random.Generator) -> Float32:
@@ -269,49 +247,23 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
     return chosen
 
 
-def aggregate(
-    descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
-) -> Float32:
+def aggregate(descriptors: NDArray[Any], vocabulary: Vocabulary) -> Float32:
     """Compute the unit-norm VLAD, float32 (M,), of descriptors (N, D); zero if N is 0."""
-    options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
-    if len(data) and data.shape[1] != vocabulary.centres.shape[2]:
+    centres = vocabulary.centres
+    if len(data) and data.shape[1] != centres.shape[1]:
         raise DataError(
             f"descriptors have {data.shape[1]} dimensions, "
-            f"but the vocabulary has {vocabulary.centres.shape[2]}"
+            f"but the vocabulary has {centres.shape[1]}"
         )
     if len(data) == 0:
         return np.zeros(vocabulary.size, dtype=np.float32)
-    blocks = [_aggregate_one(data, centres, options) for centres in vocabulary.centres]
-    return vocabulary.whiten(_unit(np.concatenate(blocks)).astype(np.float32))
-
-
-def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDArray[np.float64]:
-    if options.assignment == "hard":
-        labels = _nearest(data, centres)
-        sums = _sum_by_label(data, labels, len(centres))
-        counts = np.bincount(labels, minlength=len(centres))[:, None]
-        residuals = sums - counts * centres
-    else:
-        residuals = np.zeros(centres.shape)
-        for start in range(0, len(data), _CHUNK):
-            part = data[start : start + _CHUNK]
-            weights = soft_assignment(part, centres, ALPHA)
-            residuals += weights.T @ part - weights.sum(axis=0)[:, None] * centres
-    return _unit(_unit(residuals).ravel())
-
-
-def soft_assignment(
-    descriptors: NDArray[np.floating[Any]], centres: NDArray[np.floating[Any]], alpha: float
-) -> NDArray[np.float64]:
-    """Return ``a_k(x_i)`` of NetVLAD's equation 2: (N, K) float64, rows sum to one."""
-    from scipy.special import softmax
-
-    data = np.asarray(descriptors, dtype=np.float64)
-    centres = np.asarray(centres, dtype=np.float64)
-    # |x|^2 is omitted because it cancels within a row
-    logits = alpha * (2.0 * data @ centres.T - np.einsum("kd,kd->k", centres, centres))
-    return np.asarray(softmax(logits, axis=1))
+    labels = _nearest(data, centres)
+    counts = np.bincount(labels, minlength=len(centres))[:, None]
+    residuals = _sum_by_label(data, labels, len(centres)) - counts * centres
+    vector = _unit(_unit(residuals).ravel())
+    # normalise again, since the first division rounds the length
+    return vocabulary.whiten(_unit(vector).astype(np.float32))
 
 
 def _unit(values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

@@ -500,7 +500,7 @@ class MapMatching:
             return image.describe(kind.extractor or kind.choice.make(self.options.placement))
         vocabulary, settings = self._vlad(kind)
         descriptors = features[self._position(settings.local_type)].descriptors
-        return aggregate(descriptors, vocabulary, settings.options)
+        return aggregate(descriptors, vocabulary)
 
     def _of_map(self, kind: _GlobalType) -> NDArray[np.float32]:
         with self._lock:
@@ -516,12 +516,7 @@ class MapMatching:
         if kind.is_vlad:
             vocabulary, settings = self._vlad(kind)
             local = self.types[self._position(settings.local_type)]
-            return np.stack(
-                [
-                    aggregate(local.descriptors(name), vocabulary, settings.options)
-                    for name in images
-                ]
-            )
+            return np.stack([aggregate(local.descriptors(name), vocabulary) for name in images])
         require(
             self._map.has_images(),
             f"the map has no global features {kind.name!r}, and no images to compute them from",

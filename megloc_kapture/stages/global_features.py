@@ -85,9 +85,8 @@ def extract_vlad(
 def _aggregate(local_type: str, place: Path, job: Job) -> NDArray[np.float32]:
     stored = read_vocabulary(place)
     assert stored is not None
-    vocabulary, settings = stored
     image, folder = job
-    return aggregate(_descriptors(folder, local_type, image), vocabulary, settings.options)
+    return aggregate(_descriptors(folder, local_type, image), stored[0])
 
 
 def _write_vectors(
@@ -243,7 +242,7 @@ class ExtractGlobalFeatures(PipelineStage):
     """Extract global features of all images for retrieval."""
 
     name = "global_features"
-    version = 2
+    version = 3
     resumes = True
     uses = ("global_features.name", "global_features.options", *LOCAL_TYPES)
     explained_by = ("global_features",)

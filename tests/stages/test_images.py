@@ -448,11 +448,11 @@ def assert_described_by(root: Path, folders: list[KaptureFolder], options: VladO
     assert found is not None
     vocabulary, settings = found
     assert (settings.local_type, settings.options) == ("rootsift", options)
-    assert vocabulary.centres.shape == (options.vocabularies, 8, 128)
+    assert vocabulary.centres.shape == (8, 128)
     for folder in folders:
         stored = folder.with_features([root]).global_features("vlad_rootsift")
         for image in folder.read().image_names():
-            expected = aggregate(folder.descriptors("rootsift").read(image), vocabulary, options)
+            expected = aggregate(folder.descriptors("rootsift").read(image), vocabulary)
             np.testing.assert_allclose(stored.read(image), expected, atol=1e-5)
 
 
@@ -488,12 +488,12 @@ def test_a_map_without_descriptors_is_refused(
 def test_a_stored_vocabulary_is_read_back(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     mean, projection, centres = (
-        rng.normal(size=size).astype(np.float32) for size in (30, (4, 30), (2, 3, 5))
+        rng.normal(size=size).astype(np.float32) for size in (15, (4, 15), (3, 5))
     )
     vocabulary = Vocabulary(centres, mean, projection)
-    write_vocabulary(tmp_path, vocabulary, "r2d2", VladOptions(vocabularies=2, dimensions=4))
+    write_vocabulary(tmp_path, vocabulary, "r2d2", VladOptions(num_clusters=3, dimensions=4))
     stored, settings = read_vocabulary(tmp_path) or pytest.fail("no vocabulary")
-    assert (settings.local_type, settings.options.vocabularies) == ("r2d2", 2)
+    assert (settings.local_type, settings.options.num_clusters) == ("r2d2", 3)
     np.testing.assert_array_equal(stored.centres, centres)
     np.testing.assert_array_equal(stored.mean, mean)
     np.testing.assert_array_equal(stored.projection, projection)
