@@ -197,9 +197,6 @@ def pixels_of(
     view: PosedImage, max_side_px: int
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.bool_], Floats | None]:
     """Return a reduced view: camera, colours (N, 3), usable pixels (N,) and depths (N,)."""
-    if view.image.shape != (view.camera.height, view.camera.width, 3):
-        size = f"{view.camera.width}x{view.camera.height}"
-        raise DataError(f"image {view.name}: {view.image.shape} does not fit a camera of {size}")
     camera = reduced_camera(view.camera, max_side_px)
     pixels = camera.width, camera.height
     image = view.image

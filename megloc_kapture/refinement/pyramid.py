@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays, in_image, project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
@@ -53,11 +52,6 @@ class DepthPoints:
 
 def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
     """Back-project sampled pixels of a depth map that its image sees, except at depth edges."""
-    if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
-        raise DataError(
-            f"a depth map of {depth.depth_m.shape} does not fit a camera of "
-            f"{depth.camera.width}x{depth.camera.height}"
-        )
     rows, columns, rays = _grid(depth.camera)
     inverse = _inverse_depth(depth.depth_m)
     middle = inverse[rows, columns]
@@ -169,8 +163,6 @@ def build_pyramid(
     ``colours`` are red, green and blue normalised likewise.
     """
     height, width = image.shape[:2]
-    if mask is not None and mask.shape != (height, width):
-        raise DataError(f"a mask of {mask.shape} does not fit an image of {(height, width)}")
     used = np.ones((height, width), np.float32) if mask is None else mask.astype(np.float32)
     seen = image if appearance == "colours" else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     values = (seen.astype(np.float32) * np.float32(1 / 255)).reshape(height, width, -1)

@@ -13,16 +13,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import in_image, project
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
 from megloc_kapture.geometry.warping import PosedImage, image_with_depth
 from megloc_kapture.plugins import RankingScene
-from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE, RenderingOptions
+from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE
 from megloc_kapture.refinement.pyramid import (
     DepthPoints,
-    Level,
-    build_pyramid,
     lift_points,
     visibility,
 )
@@ -92,21 +89,6 @@ class ReferenceImages:
 def lifted(reference: PosedImage) -> DepthPoints:
     assert reference.depth is not None
     return lift_points(reference.camera, reference.cam_from_world, reference.depth)
-
-
-def pyramid_of(view: PosedImage, options: RenderingOptions) -> list[Level]:
-    """Build the pyramid of an image, finest first."""
-    image, camera = view.image, view.camera
-    if image.shape != (camera.height, camera.width, 3):
-        raise DataError(
-            f"an image of {image.shape} does not fit a camera of {camera.width}x{camera.height}"
-        )
-    return build_pyramid(
-        image,
-        view.mask,
-        max_side_px=options.max_side_px,
-        appearance=options.appearance,
-    )
 
 
 def spread_names(names: Sequence[str]) -> list[str]:

@@ -31,11 +31,16 @@ from megloc_kapture.refinement.photometric import (
     minimise,
     unoccluded_points,
 )
-from megloc_kapture.refinement.pyramid import Seen, choose_points, usable_cells, visibility
+from megloc_kapture.refinement.pyramid import (
+    Seen,
+    build_pyramid,
+    choose_points,
+    usable_cells,
+    visibility,
+)
 from megloc_kapture.refinement.references import (
     ReferenceImages,
     lifted,
-    pyramid_of,
     references_elsewhere,
 )
 from megloc_kapture.values import Camera, RigidTransform
@@ -66,8 +71,11 @@ class RenderingRefinement:
     ) -> None:
         self.options = options
         self.camera, self.start = query.camera, query.cam_from_world
-        self.query_levels = pyramid_of(query, options)
-        self.levels = [pyramid_of(each, options) for each in references]
+        side_px, appearance = options.max_side_px, options.appearance
+        self.query_levels, *self.levels = (
+            build_pyramid(each.image, each.mask, max_side_px=side_px, appearance=appearance)
+            for each in (query, *references)
+        )
         self.points = [lifted(each) for each in references]
 
     def refine(self) -> PoseRefinement:

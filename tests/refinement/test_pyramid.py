@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 from poses import rigid
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.refinement.pyramid import (
@@ -89,13 +88,6 @@ def test_gradient_energy_is_that_of_central_differences() -> None:
     expected = (values[50, 81] - values[50, 79]) ** 2 + (values[51, 80] - values[49, 80]) ** 2
     assert energy[50, 80] == pytest.approx(expected)
     assert not energy[0].any() and not energy[:, -1].any() and not energy[70, 99:102].any()
-
-
-def test_mismatched_sizes_are_refused() -> None:
-    with pytest.raises(DataError, match="mask"):
-        build_pyramid(picture(), np.ones((10, 10), bool))
-    with pytest.raises(DataError, match="depth map"):
-        lift_points(CAMERA, HERE, DepthView(CAMERA, np.ones((10, 10), np.float32), HERE))
 
 
 def test_points_project_to_their_pixels() -> None:

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from poses import displaced
 from scenes import Scene
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.plugins import DepthView
@@ -24,7 +23,6 @@ from megloc_kapture.refinement.references import (
     MAX_TRIED,
     ReferenceImages,
     contradicts,
-    pyramid_of,
     references_elsewhere,
     spread_names,
 )
@@ -90,12 +88,6 @@ def posed(images: Map, change: Callable[[int, RigidTransform], RigidTransform]) 
 def with_depth(images: Map, change: Callable[[DepthView], dict[str, Any]]) -> Map:
     """Replace fields of every image's depth."""
     return changed(images, lambda _, each: {"depth": replace(each.depth, **change(each.depth))})
-
-
-def test_an_image_must_fit_its_camera(corner: Map) -> None:
-    image = corner["0.png"]
-    with pytest.raises(DataError, match="does not fit a camera"):
-        pyramid_of(replace(image, image=image.image[:50]), RenderingOptions())
 
 
 def test_an_exact_map_is_consistent(corner: Map) -> None:
