@@ -19,7 +19,13 @@ from pydantic import Field
 from megloc_kapture.features.network import Images
 from megloc_kapture.geometry.cameras import reduced_size
 from megloc_kapture.nets.delg import delg_from
-from megloc_kapture.nets.global_descriptors import STRIDE_PX, apgem_from, netvlad, openibl
+from megloc_kapture.nets.global_descriptors import (
+    STRIDE_PX,
+    WHITENING_POWER,
+    apgem_from,
+    netvlad,
+    openibl,
+)
 from megloc_kapture.nets.megaloc import PATCH_PX, megaloc_from, squared
 from megloc_kapture.nets.runtime import (
     Checkpointed,
@@ -126,12 +132,6 @@ class ApGemOptions(NetworkOptions):
         description="name of a PCA whitening in the checkpoint, as in the authors' evaluation; "
         "empty: no whitening, the default of their kapture tool",
     )
-    whitening_power: float = Field(
-        default=0.25,
-        ge=0,
-        le=1,
-        description="components are divided by their variances raised to this power",
-    )
     max_size_px: int | None = Field(
         default=1024,
         ge=32,
@@ -149,9 +149,9 @@ class ApGem(GlobalNetwork[ApGemOptions]):
 
     def __init__(self, options: ApGemOptions | None = None) -> None:
         super().__init__(options)
-        self._load_with = self.options.whitening, self.options.whitening_power
+        self._load_with = (self.options.whitening,)
         if self.options.whitening:
-            self.name += f"-{self.options.whitening}-{self.options.whitening_power:g}"
+            self.name += f"-{self.options.whitening}-{WHITENING_POWER:g}"
 
 
 class DelgOptions(NetworkOptions):

@@ -39,6 +39,8 @@ _AVERAGE_IMAGE = "average_image"
 # OpenIBL's mean for colours in [0, 1], times 255
 _OPENIBL_MEAN_RGB = (123.68, 116.779, 103.939)
 DESCRIPTOR_SIZE = 2048
+# components of AP-GeM are divided by powers of their variances, as in the authors' evaluation
+WHITENING_POWER = 0.25
 # optional whitening in a checkpoint, under scikit-learn's names
 PCA_PARTS = ("mean", "components", "explained_variance", "whiten")
 
@@ -206,12 +208,10 @@ class ApGemNet(ResNet):
             return functional.normalize(self.whitening(vectors))
 
 
-def apgem_from(
-    tensors: Mapping[str, torch.Tensor], where: str, whitening: str = "", power: float = 0.25
-) -> ApGemNet:
+def apgem_from(tensors: Mapping[str, torch.Tensor], where: str, whitening: str = "") -> ApGemNet:
     """Build the network from the tensors of ``scripts/convert_weights.py``, for inference.
 
-    ``whitening`` and ``power`` are those of :func:`whitening_from`; an empty name means none.
+    ``whitening`` is a name in the checkpoint; an empty name means none.
     """
     settings = ("preprocess.", "model_options.", "pca.")
     state = {key: value for key, value in tensors.items() if not key.startswith(settings)}
@@ -229,18 +229,12 @@ def apgem_from(
     )
     load_strictly(net, state, where, may_lack=batch_counters(net))
     if whitening:
-        net.whitening = whitening_from(tensors, whitening, where, power=power)
+        net.whitening = whitening_from(tensors, whitening, where)
     return net.eval()
 
 
-def whitening_from(
-    tensors: Mapping[str, torch.Tensor], name: str, where: str, *, power: float
-) -> nn.Linear:
-    """Build a PCA whitening, for vectors that are normalised afterwards.
-
-    Components are divided by their variances raised to ``power``: 0.5 in scikit-learn, 0.25 in the
-    authors' evaluation.
-    """
+def whitening_from(tensors: Mapping[str, torch.Tensor], name: str, where: str) -> nn.Linear:
+    """Build a PCA whitening, for vectors that are normalised afterwards."""
     known = sorted({key.split(".")[1] for key in tensors if key.startswith("pca.")})
     if name not in known:
         raise OptionError(
@@ -250,7 +244,7 @@ def whitening_from(
     mean, components, variance, whiten = (tensors[f"pca.{name}.{part}"] for part in PCA_PARTS)
     weight = components.double()
     if whiten:
-        weight = variance.double().pow(-power)[:, None] * weight
+        weight = variance.double().pow(-WHITENING_POWER)[:, None] * weight
     layer = nn.Linear(weight.shape[1], weight.shape[0])
     layer.weight.data, layer.bias.data = weight.float(), -(weight @ mean.double()).float()
     return layer

@@ -41,6 +41,7 @@ from megloc_kapture.refinement.neural_field import (
 _PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
 _DECAY = 1 / 30
 _KEEP_EVERY = 200
+_DEPTH_WEIGHT = 5.5  # of the relative depth error, added to NeRF-W's loss
 
 
 class FieldTrainingOptions(NetworkOptions):
@@ -61,9 +62,6 @@ class FieldTrainingOptions(NetworkOptions):
         default=320,
         ge=16,
         description="longer side of the training images; larger ones are reduced",
-    )
-    depth_weight: float = Field(
-        default=5.5, ge=0, description="weight of the relative depth error, added to NeRF-W's loss"
     )
     held_out_every: int = Field(default=8, ge=0, description="hold out every N-th image; 0: none")
     lights: Lights = Field(
@@ -168,7 +166,7 @@ class FieldTrainer:
         if (depth := rays.depth) is not None:
             error = (rendered.depth - depth).abs() / depth.clamp_min(1e-6)
             known = torch.where(depth > 0, error.clamp(max=1.0), 0.0)
-            loss = loss + options.depth_weight * known.mean()
+            loss = loss + _DEPTH_WEIGHT * known.mean()
         self._optimizer.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         self._optimizer.step()

@@ -28,6 +28,9 @@ _TRANSLATION_EPSILON_M = 1e-4
 _CONVERGED = 5e-5  # a step with a smaller norm (radians, metres) is the last
 # Cauchy scale with 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
+# pixels whose depth differs from a neighbour's by more than this share of the smaller depth are
+# edges; on a plane tilted by 80 degrees, with a focal length of 585 px, the share is about 0.014
+_MAX_JUMP = 0.05
 
 
 class DepthCloudOptions(Options):
@@ -37,13 +40,6 @@ class DepthCloudOptions(Options):
         description="largest depth, metres. The noise of structured-light sensors grows with the "
         "square of the distance and is 2.6 cm at 4 m, the end of their rated range; raise the "
         "limit for laser scanners",
-    )
-    max_jump: float = Field(
-        default=0.05,
-        gt=0,
-        description="pixels whose depth differs from a neighbour's by more than this share of the "
-        "smaller depth are dropped as edges; on a plane tilted by 80 degrees, with a focal length "
-        "of 585 px, the share is about 0.014",
     )
 
 
@@ -65,7 +61,7 @@ def depth_cloud(
     sampled = np.s_[step_px // 2 :: step_px, step_px // 2 :: step_px]
     z = depth[sampled]
     with np.errstate(invalid="ignore"):
-        trusted = (z > 0) & (z <= options.max_depth_m) & ~_on_edge(depth, sampled, options.max_jump)
+        trusted = (z > 0) & (z <= options.max_depth_m) & ~_on_edge(depth, sampled)
     rows = np.arange(depth.size).reshape(depth.shape)[sampled][trusted]
     points = view.image_from_depth.apply(
         pixel_rays(view.camera)[rows] * z[trusted].astype(np.float64)[:, None]
@@ -76,12 +72,10 @@ def depth_cloud(
     return points[values_at(image_mask, image_camera, px, outside=True)]
 
 
-def _on_edge(
-    depth: NDArray[np.float32], sampled: tuple[slice, slice], max_jump: float
-) -> NDArray[np.bool_]:
+def _on_edge(depth: NDArray[np.float32], sampled: tuple[slice, slice]) -> NDArray[np.bool_]:
     height, width = depth.shape
     padded = np.pad(depth, 1)
-    z, limit = depth[sampled], np.float32(1.0 + max_jump)
+    z, limit = depth[sampled], np.float32(1.0 + _MAX_JUMP)
     edge = np.zeros(z.shape, bool)
     with np.errstate(invalid="ignore"):
         for down, right in product((0, 1, 2), (0, 1, 2)):

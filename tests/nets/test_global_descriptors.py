@@ -153,17 +153,17 @@ def pca(name: str = "Landmarks_clean", *, whiten: bool = True, size: int = 2048)
     }
 
 
-@pytest.mark.parametrize(("whiten", "power"), [(True, 0.25), (True, 0.5), (False, 0.25)])
-def test_whitening_is_the_authors_formula(whiten: bool, power: float) -> None:
+@pytest.mark.parametrize("whiten", [True, False])
+def test_whitening_is_the_authors_formula(whiten: bool) -> None:
     parts = pca(whiten=whiten)
     vectors = torch.nn.functional.normalize(torch.randn(3, 2048))
-    whiten_linearly = whitening_from(parts, "Landmarks_clean", "w.pt", power=power)
+    whiten_linearly = whitening_from(parts, "Landmarks_clean", "w.pt")
     with torch.inference_mode():
         result = torch.nn.functional.normalize(whiten_linearly(vectors))
     mean, components, variance, _ = (value.double().numpy() for value in parts.values())
     expected = (vectors.numpy() - mean) @ components.T
     if whiten:
-        expected /= variance**power
+        expected /= variance**0.25
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     assert result.shape == (3, 40) and result.dtype == torch.float32
     np.testing.assert_allclose(result.numpy(), expected, atol=1e-6)
@@ -179,4 +179,4 @@ def test_whitening_is_the_authors_formula(whiten: bool, power: float) -> None:
 )
 def test_missing_whitenings_are_refused(parts: Tensors, name: str, message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        whitening_from(parts, name, "w.pt", power=0.25)
+        whitening_from(parts, name, "w.pt")

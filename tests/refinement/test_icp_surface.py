@@ -209,7 +209,7 @@ def pixel_by_pixel(depth: np.ndarray, options: DepthCloudOptions, step_px: int) 
                 for c in range(max(column - 1, 0), min(column + 2, SMALL_CAMERA.width))
                 if depth[r, c] > 0
             ]
-            if any(max(z, other) / min(z, other) > 1 + options.max_jump for other in around):
+            if any(max(z, other) / min(z, other) > 1.05 for other in around):
                 continue
             points.append([(column + 0.5 - cx) / fx * z, (row + 0.5 - cy) / fy * z, z])
     return IMAGE_FROM_DEPTH.apply(np.array(points).reshape(-1, 3))
