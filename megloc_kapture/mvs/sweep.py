@@ -43,7 +43,7 @@ _TONE = 20.0  # difference from the centre's brightness (0 to 255) that has the 
 _P1, _P2, _EDGE = 8.0, 40.0, 20.0
 _DIRECTIONS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
 # matching error in pixels, and factor for the least-squares deviation (docs/experiments/mvs.md)
-CALIBRATION = np.array([0.15, 2.0])
+_CALIBRATION = np.array([0.15, 2.0])
 _MAX_COST = 0.7  # largest accepted 1 - ZNCC
 
 
@@ -133,7 +133,7 @@ class ColmapStereo:
             normals = read_map(map_path(root, "normal", names[0]))
         known = (depth > 0) & (normals[..., 2] < 0)
         planes = planes_of(reference.camera, np.where(known, depth, 1), normals)
-        deviations = matching_deviations(reference, sources, planes, CALIBRATION)
+        deviations = matching_deviations(reference, sources, planes)
         deviations[~known] = 0.0
         return as_estimate(reference.camera, planes, deviations)
 
@@ -255,13 +255,13 @@ def refine(
     costs = np.full(grey.shape, 2.0, np.float32)
     for number in range(passes):
         refine_planes(grey, *views, planes, costs, _REACH, _TONE, number, step, limits)
-    deviations = matching_deviations(reference, sources, planes, CALIBRATION)
+    deviations = matching_deviations(reference, sources, planes)
     deviations[costs > _MAX_COST] = 0.0
     return deviations
 
 
 def matching_deviations(
-    reference: StereoView, sources: Sequence[StereoView], planes: Floats, calibration: Floats
+    reference: StereoView, sources: Sequence[StereoView], planes: Floats
 ) -> Image:
     """Estimate deviations (H, W) of the planes' inverse depth from matching; 0 without a match."""
     from megloc_kapture.mvs.plane_kernels import plane_deviations
@@ -269,7 +269,7 @@ def matching_deviations(
     grey = stereo_image(reference)
     deviations = np.empty(grey.shape, np.float32)
     views = _compared(reference, sources)
-    plane_deviations(grey, *views, planes, _REACH, _TONE, calibration, deviations)
+    plane_deviations(grey, *views, planes, _REACH, _TONE, _CALIBRATION, deviations)
     return deviations
 
 

@@ -121,11 +121,9 @@ def spacings(t: torch.Tensor, rays: Rays) -> torch.Tensor:
 
 def stratified(rays: Rays, count: int, generator: torch.Generator | None) -> torch.Tensor:
     """Sample one t in each of ``count`` intervals of a ray, which grow with t: (N, count)."""
-    number = len(rays.origins)
-    shares = torch.arange(count, device=rays.origins.device, dtype=rays.origins.dtype)
-    within = _uniform((number, count), generator, rays.origins)
+    shares = _shares(len(rays.origins), count, generator, rays.origins)
     ratio = torch.log(rays.origins.new_tensor(rays.far / rays.near))
-    return rays.near * torch.exp((shares + within) / count * ratio)
+    return rays.near * torch.exp(shares * ratio)
 
 
 def importance(
@@ -136,8 +134,7 @@ def importance(
     inner = weights[:, 1:-1].detach() + 1e-5
     shares = torch.cumsum(inner / inner.sum(1, keepdim=True), dim=1)
     shares = torch.cat([torch.zeros_like(shares[:, :1]), shares], dim=1)
-    drawn = torch.arange(count, device=t.device, dtype=t.dtype)
-    drawn = (drawn + _uniform((len(t), count), generator, t)) / count
+    drawn = _shares(len(t), count, generator, t)
     above = torch.searchsorted(shares, drawn.contiguous(), right=True).clamp(1, shares.shape[1] - 1)
     low, high = shares.gather(1, above - 1), shares.gather(1, above)
     begin, end = edges.gather(1, above - 1), edges.gather(1, above)
@@ -148,20 +145,21 @@ def about_depth(
     depth: torch.Tensor, instead: torch.Tensor, generator: torch.Generator | None
 ) -> torch.Tensor:
     """Return stratified samples (N, S) around depths (N,), and ``instead`` where they are 0."""
-    count = instead.shape[1]
-    drawn = torch.arange(count, device=depth.device, dtype=depth.dtype)
-    drawn = (drawn + _uniform(tuple(instead.shape), generator, depth)) / count
+    drawn = _shares(*instead.shape, generator, depth)
     return torch.where(
         depth[:, None] > 0, depth[:, None] * (1 + _DEPTH_SPREAD * (2 * drawn - 1)), instead
     )
 
 
-def _uniform(
-    shape: tuple[int, ...], generator: torch.Generator | None, like: torch.Tensor
+def _shares(
+    rows: int, count: int, generator: torch.Generator | None, like: torch.Tensor
 ) -> torch.Tensor:
-    if generator is None:
-        return torch.full(shape, 0.5, dtype=like.dtype, device=like.device)
-    return torch.rand(shape, generator=generator, dtype=like.dtype).to(like.device)
+    """Return one position in each of ``count`` equal parts of 0 to 1: (rows, count), ascending."""
+    within: torch.Tensor | float = 0.5
+    if generator is not None:
+        within = torch.rand((rows, count), generator=generator, dtype=like.dtype).to(like.device)
+    parts = torch.arange(count, device=like.device, dtype=like.dtype).expand(rows, -1)
+    return (parts + within) / count
 
 
 def frequencies(values: torch.Tensor, count: int) -> torch.Tensor:

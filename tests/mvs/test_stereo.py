@@ -18,7 +18,6 @@ from megloc_kapture.io.colmap import MapImage
 from megloc_kapture.io.colmap_mapping import has_cuda, map_path, read_map, write_workspace
 from megloc_kapture.mvs.kernels import add_path, best_labels, correlate
 from megloc_kapture.mvs.sweep import (
-    CALIBRATION,
     ColmapStereo,
     Sweep,
     as_estimate,
@@ -157,7 +156,7 @@ def test_repeating_a_source_does_not_change_the_deviation() -> None:
     exact = truth(0)
     planes = np.stack([1 / exact, 0 * exact, 0 * exact], axis=-1).astype(np.float64)
     once, thrice, other, both = (
-        matching_deviations(view(0), [view(n) for n in sources], planes, CALIBRATION)
+        matching_deviations(view(0), [view(n) for n in sources], planes)
         for sources in ([1], [1, 1, 1], [2], [1, 2])
     )
     np.testing.assert_allclose(once, thrice, rtol=1e-6)
