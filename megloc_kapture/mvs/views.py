@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import (
     PINHOLE_MODELS,
+    pixel_rays,
     px_from_cam,
     reduced_camera,
     with_two_focals,
@@ -89,7 +90,9 @@ def stereo_view(
         return reduced_view(StereoView(image, camera, cam_from_world, mask), pinhole)
     # reduce first, to avoid aliasing
     lens = reduced_camera(camera, max(pinhole.width, pinhole.height))
-    x, y = _undistortion(lens, pinhole)
+    # pixels of the pinhole image in the lens image's array, whose first pixel's centre is (0, 0)
+    px = np.nan_to_num(px_from_cam(lens, pixel_rays(pinhole)) - 0.5, nan=-1e4).astype(np.float32)
+    x, y = (side.reshape(pinhole.height, pinhole.width) for side in px.T)
     reduced = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
     small = np.asarray(cv2.remap(reduced, x, y, cv2.INTER_LINEAR), np.uint8)
     allowed = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
@@ -107,15 +110,6 @@ def reduced_view(view: StereoView, camera: Camera) -> StereoView:
         if mask is not None:
             mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     return StereoView(image, camera, view.cam_from_world, mask)
-
-
-def _undistortion(lens: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], ...]:
-    """Return array coordinates x and y, float32 (H, W), of a pinhole's pixels in the lens image."""
-    fx, fy, cx, cy = pinhole.params
-    u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
-    rays = np.stack([(u.ravel() - cx) / fx, (v.ravel() - cy) / fy, np.ones(u.size)], axis=1)
-    px = np.nan_to_num(px_from_cam(lens, rays) - 0.5, nan=-1e4).astype(np.float32)
-    return px[:, 0].reshape(u.shape), px[:, 1].reshape(u.shape)
 
 
 def choose_sources(

@@ -61,29 +61,22 @@ class ReferenceImages:
     def near(
         self,
         cam_from_world: RigidTransform,
-        first: Sequence[str],
+        among: Sequence[str],
         *,
         max_references: int,
-        only_first: bool = False,
         min_distance_m: float = 0.0,
     ) -> list[str]:
-        """Return images with a similar viewing direction, preferably half of them from ``first``.
+        """Return images with a similar viewing direction, nearest first.
 
-        Each half is sorted by distance. ``first`` are images with matches; ``only_first`` excludes
-        all others.
+        They are from ``among``, the images with matches; without any, all images are candidates.
         """
         forward = cam_from_world.rotation_matrix()[2]
         facing = self._directions @ forward >= np.cos(np.deg2rad(_MAX_ANGLE_DEG))
         distances = np.linalg.norm(self._centers - cam_from_world.center(), axis=1)
         usable = facing & (distances >= min_distance_m)
-        order = [int(row) for row in np.argsort(distances, kind="stable") if usable[row]]
-        known = set(first)
-        chosen = [row for row in order if self.names[row] in known]
-        if only_first:
-            return [self.names[row] for row in chosen[:max_references]]
-        chosen = chosen[: (max_references + 1) // 2]
-        chosen += [row for row in order if row not in set(chosen)][: max_references - len(chosen)]
-        return [self.names[row] for row in chosen]
+        order = [self.names[row] for row in np.argsort(distances, kind="stable") if usable[row]]
+        candidates = set(among or self.names)
+        return [name for name in order if name in candidates][:max_references]
 
 
 def lifted(reference: PosedImage) -> DepthPoints:

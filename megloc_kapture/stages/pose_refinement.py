@@ -182,12 +182,9 @@ class MapRefiners:
         :meth:`test` must be called for the pose first.
         """
         frame = self._frame(pose)
+        # a third-party pose has no candidates; the nearest map images are used
         near = self._by_frame[frame].near(
-            pose.cam_from_world,
-            pose.candidates,
-            max_references=_MAX_REFERENCES,
-            # a third-party pose has no candidates; the nearest map images are used
-            only_first=bool(pose.candidates),
+            pose.cam_from_world, pose.candidates, max_references=_MAX_REFERENCES
         )
         return tuple(near), tuple(
             verdict.reason if verdict else "" for verdict in self._verdicts[frame]
