@@ -181,7 +181,10 @@ class SuperPointNet(nn.Module):
 def superpoint_from(
     tensors: Mapping[str, torch.Tensor], where: str, descriptor_weights: WeightsFile | None = None
 ) -> SuperPointNet | SuperPointBatchNormNet:
-    """Build the network of a checkpoint in either layout, with optional descriptor weights."""
+    """Build the network of a checkpoint in either layout, with optional descriptor weights.
+
+    A descriptor head without a backbone uses the detector's features.
+    """
     if any(key.startswith("backbone.") for key in tensors):
         if descriptor_weights is not None:
             raise OptionError(
@@ -192,28 +195,10 @@ def superpoint_from(
         return load_strictly(net, tensors, where, may_lack=batch_counters(net))
     if descriptor_weights is None:
         return load_strictly(SuperPointNet(), tensors, where)
-    return superpoint_with_descriptor(
-        tensors,
-        read_weights(descriptor_weights),
-        detector_where=where,
-        descriptor_where=str(descriptor_weights.path),
-    )
-
-
-def superpoint_with_descriptor(
-    detector: Mapping[str, torch.Tensor],
-    descriptor: Mapping[str, torch.Tensor],
-    *,
-    detector_where: str,
-    descriptor_where: str,
-) -> SuperPointNet:
-    """Combine the detector of one checkpoint with the descriptors of another.
-
-    A descriptor head without a backbone uses the detector's features.
-    """
+    descriptor, descriptor_where = read_weights(descriptor_weights), str(descriptor_weights.path)
     head = {key: value for key, value in descriptor.items() if not key.startswith("convP")}
-    frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}
-    detects = load_strictly(SuperPointNet(descriptor=False), frozen, detector_where)
+    frozen = {key: value for key, value in tensors.items() if not key.startswith("convD")}
+    detects = load_strictly(SuperPointNet(descriptor=False), frozen, where)
     if any(key.startswith(("conv1", "conv2", "conv3", "conv4")) for key in head):
         detects.describer = load_strictly(SuperPointNet(detector=False), head, descriptor_where)
         return detects

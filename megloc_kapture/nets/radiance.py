@@ -145,7 +145,7 @@ def about_depth(
     depth: torch.Tensor, instead: torch.Tensor, generator: torch.Generator | None
 ) -> torch.Tensor:
     """Return stratified samples (N, S) around depths (N,), and ``instead`` where they are 0."""
-    drawn = _shares(*instead.shape, generator, depth)
+    drawn = _shares(len(depth), instead.shape[1], generator, depth)
     return torch.where(
         depth[:, None] > 0, depth[:, None] * (1 + _DEPTH_SPREAD * (2 * drawn - 1)), instead
     )

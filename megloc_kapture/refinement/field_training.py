@@ -27,7 +27,6 @@ from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device,
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
     FieldModule,
-    Floats,
     Kind,
     Lights,
     NeuralField,
@@ -225,7 +224,8 @@ class _Pixels:
             near, far = float(0.5 * np.quantile(known, 0.01)), float(1.5 * np.quantile(known, 0.99))
             rows = self._usable[self._depth[self._usable] > 0]
             rows = rows[:: max(1, len(rows) // 20000)]
-            points = self._points(rows, self._depth)
+            image, rays = self._world_rays(rows)
+            points = self._centres[image] + rays * self._depth[rows, None]
             low = np.minimum(low, np.quantile(points, 0.005, axis=0))
             high = np.maximum(high, np.quantile(points, 0.995, axis=0))
         else:
@@ -234,10 +234,6 @@ class _Pixels:
         scale = 0.5 * float((high - low).max())
         x, y, z = centre.tolist()
         return FieldFrame(centre=(x, y, z), scale=scale, near=near, far=far)
-
-    def _points(self, rows: NDArray[np.int64], depth: Floats) -> NDArray[np.float64]:
-        image, rays = self._world_rays(rows)
-        return np.asarray(self._centres[image] + rays * depth[rows, None])
 
     def _world_rays(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         image = np.searchsorted(self._starts, rows, side="right") - 1
@@ -257,20 +253,12 @@ class _Pixels:
         chosen = torch.randint(len(self._usable), (count,), generator=generator).numpy()
         rows = self._usable[chosen]
         image, directions = self._world_rays(rows)
-        frame, device = field.frame, field.device
-
-        def tensor(values: NDArray[np.floating]) -> torch.Tensor:
-            return torch.from_numpy(np.asarray(values, np.float32)).to(device)
-
-        index = torch.from_numpy(image).to(device)
-        module = field.module
-        rays = Rays(
-            tensor((self._centres[image] - frame.centre) / frame.scale),
-            tensor(directions / frame.scale),
-            frame.near,
-            frame.far,
-            module.appearance(field.light_rows[index]),
-            module.transient(index),
-            None if self._depth is None else tensor(self._depth[rows]),
+        index = torch.from_numpy(image).to(field.device)
+        rays = field.rays_from(
+            self._centres[image],
+            directions,
+            appearance=field.module.appearance(field.light_rows[index]),
+            transient=field.module.transient(index),
+            depth=None if self._depth is None else field.tensor(self._depth[rows]),
         )
-        return rays, tensor(self._rgb[rows].astype(np.float32) / 255)
+        return rays, field.tensor(self._rgb[rows].astype(np.float32) / 255)

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import PurePosixPath
 from threading import Lock
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -81,9 +81,16 @@ class NeuralField:
     def rays(self, camera: Camera, cam_from_world: RigidTransform) -> Rays:
         """Return rays (H * W,) through the pixel centres of a view, by rows."""
         directions = pixel_rays(camera) @ cam_from_world.rotation_matrix()
-        origin = (cam_from_world.center() - self.frame.centre) / self.frame.scale
-        along = self._tensor(directions / self.frame.scale)
-        return Rays(self._tensor(origin).expand_as(along), along, self.frame.near, self.frame.far)
+        return self.rays_from(cam_from_world.center(), directions)
+
+    def rays_from(
+        self, centres: NDArray[np.float64], directions: NDArray[np.float64], **more: Any
+    ) -> Rays:
+        """Return rays from world points (N, 3), or (3,), along directions (N, 3) of unit depth."""
+        frame = self.frame
+        along = self.tensor(directions / frame.scale)
+        origins = self.tensor((centres - frame.centre) / frame.scale).expand_as(along)
+        return Rays(origins, along, frame.near, frame.far, **more)
 
     def appearance_of(self, image: str) -> torch.Tensor:
         """Return the appearance embedding (A,) of a training image."""
@@ -157,7 +164,7 @@ class NeuralField:
         if not len(rows):
             return None
         rays = select(self.rays(camera, view.cam_from_world), rows)
-        return self.fit_appearance(rays, self._tensor(rgb.astype(np.float32) / 255)[rows])
+        return self.fit_appearance(rays, self.tensor(rgb.astype(np.float32) / 255)[rows])
 
     def held_out_psnr(self, view: PosedImage) -> float:
         """Return the PSNR in dB on an image's right half, with the appearance of its left half.
@@ -167,7 +174,7 @@ class NeuralField:
         camera, rgb, usable, _ = pixels_of(view, max(view.camera.width, view.camera.height))
         rays = self.rays(camera, view.cam_from_world)
         left = np.arange(camera.width * camera.height) % camera.width < camera.width // 2
-        seen = self._tensor(rgb.astype(np.float32) / 255)
+        seen = self.tensor(rgb.astype(np.float32) / 255)
         ours, judged = (
             torch.from_numpy(np.flatnonzero(usable & half)).to(self.device)
             for half in (left, ~left)
@@ -180,7 +187,7 @@ class NeuralField:
         error = torch.square(rendered.clamp(0, 1) - seen[judged]).mean()
         return float(-10 * torch.log10(error.clamp_min(1e-10)))
 
-    def _tensor(self, values: NDArray[np.floating]) -> torch.Tensor:
+    def tensor(self, values: NDArray[np.floating]) -> torch.Tensor:
         return torch.from_numpy(np.asarray(values, np.float32)).to(self.device)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays, in_image, project
-from megloc_kapture.plugins import DepthView
+from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.values import Camera, RigidTransform
 
 # depth samples along the longer side of a depth map: six per chosen point at a level of 640 px
@@ -50,8 +50,10 @@ class DepthPoints:
     px: Float64
 
 
-def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
+def lift_points(reference: PosedImage) -> DepthPoints:
     """Back-project sampled pixels of a depth map that its image sees, except at depth edges."""
+    camera, depth = reference.camera, reference.depth
+    assert depth is not None
     rows, columns, rays = _grid(depth.camera)
     inverse = _inverse_depth(depth.depth_m)
     middle = inverse[rows, columns]
@@ -76,7 +78,7 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
         alone = DepthPoints(points, px)
         (seen,), _ = visibility([alone], camera, RigidTransform.identity())
         points, px = points[seen], px[seen]
-    return DepthPoints(cam_from_world.inverse().apply(points), px)
+    return DepthPoints(reference.cam_from_world.inverse().apply(points), px)
 
 
 def visibility(

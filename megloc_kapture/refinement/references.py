@@ -79,11 +79,6 @@ class ReferenceImages:
         return [name for name in order if name in candidates][:max_references]
 
 
-def lifted(reference: PosedImage) -> DepthPoints:
-    assert reference.depth is not None
-    return lift_points(reference.camera, reference.cam_from_world, reference.depth)
-
-
 def spread_names(names: Sequence[str]) -> list[str]:
     """Return at most ``MAX_TRIED`` names in van der Corput order: every prefix is spread evenly."""
     names = sorted(names)
@@ -103,7 +98,7 @@ def references_elsewhere(
     view: PosedImage, images: ReferenceImages, scene: RankingScene
 ) -> list[PosedImage]:
     """Return overlapping map images from other viewpoints, largest overlap first."""
-    surface = lifted(view)
+    surface = lift_points(view)
     points = surface.points[:: max(1, len(surface.points) // _ASKED_POINTS)]
     if len(points) == 0:
         return []
@@ -125,7 +120,7 @@ def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -
 
 
 def _share_seen(view: PosedImage, surface: DepthPoints, other: PosedImage) -> float:
-    points = lifted(other)
+    points = lift_points(other)
     (_, visible), _ = visibility([surface, points], view.camera, view.cam_from_world)
     unoccluded = DepthPoints(points.points[visible], points.px[visible])
     _, covered = visibility([unoccluded], view.camera, view.cam_from_world)

@@ -35,12 +35,12 @@ from megloc_kapture.refinement.pyramid import (
     Seen,
     build_pyramid,
     choose_points,
+    lift_points,
     usable_cells,
     visibility,
 )
 from megloc_kapture.refinement.references import (
     ReferenceImages,
-    lifted,
     references_elsewhere,
 )
 from megloc_kapture.values import Camera, RigidTransform
@@ -76,7 +76,7 @@ class RenderingRefinement:
             build_pyramid(each.image, each.mask, max_side_px=side_px, appearance=appearance)
             for each in (query, *references)
         )
-        self.points = [lifted(each) for each in references]
+        self.points = [lift_points(each) for each in references]
 
     def refine(self) -> PoseRefinement:
         start = self.start

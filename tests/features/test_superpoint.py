@@ -21,8 +21,8 @@ from megloc_kapture.features.superpoint import (
     gray_tensor,
     sample_descriptors,
     superpoint_from,
-    superpoint_with_descriptor,
 )
+from megloc_kapture.io.weights import find_weights
 
 CPU = torch.device("cpu")
 
@@ -95,7 +95,6 @@ def test_the_batch_norm_variant_is_recognised_by_its_keys(
 
 
 BACKBONE = ("conv1", "conv2", "conv3", "conv4")
-FILES = {"detector_where": "a.pth", "descriptor_where": "b.pth"}
 
 
 def random_gray(height: int, width: int, seed: int = 0) -> torch.Tensor:
@@ -117,11 +116,18 @@ def parts(weights: Tensors, *prefixes: str) -> Tensors:
     return {key: value for key, value in weights.items() if key.startswith(prefixes)}
 
 
+def combined(detector: Tensors, descriptor: Tensors, folder: Path) -> SuperPointNet:
+    torch.save(descriptor, folder / "b.pth")
+    net = superpoint_from(detector, "a.pth", find_weights(str(folder / "b.pth")))
+    assert isinstance(net, SuperPointNet)
+    return net
+
+
 @torch.inference_mode()
 @pytest.mark.parametrize("kept", [(*BACKBONE, "convD"), ("conv",)])
-def test_a_separate_descriptor_network(kept: tuple[str, ...]) -> None:
+def test_a_separate_descriptor_network(kept: tuple[str, ...], tmp_path: Path) -> None:
     frozen, tuned = random_tensors("superpoint", 3), random_tensors("superpoint", 4)
-    net = superpoint_with_descriptor(frozen, parts(tuned, *kept), **FILES)
+    net = combined(frozen, parts(tuned, *kept), tmp_path)
     assert net.describer is not None
     gray = random_gray(40, 48)
     scores, descriptors = net.eval()(gray)
@@ -130,11 +136,9 @@ def test_a_separate_descriptor_network(kept: tuple[str, ...]) -> None:
 
 
 @torch.inference_mode()
-def test_a_descriptor_head_on_the_detectors_features() -> None:
+def test_a_descriptor_head_on_the_detectors_features(tmp_path: Path) -> None:
     frozen, tuned = random_tensors("superpoint", 3), random_tensors("superpoint", 4)
-    net = superpoint_with_descriptor(
-        parts(frozen, *BACKBONE, "convP"), parts(tuned, "convD"), **FILES
-    )
+    net = combined(parts(frozen, *BACKBONE, "convP"), parts(tuned, "convD"), tmp_path)
     gray = random_gray(40, 48)
     scores, descriptors = net.eval()(gray)
     whole = superpoint_from(frozen, "a.pth").eval()
@@ -145,16 +149,16 @@ def test_a_descriptor_head_on_the_detectors_features() -> None:
     assert not torch.allclose(descriptors, whole(gray)[1], atol=0.1)
 
 
-def test_unsuitable_checkpoints_are_named() -> None:
+def test_unsuitable_checkpoints_are_named(tmp_path: Path) -> None:
     weights = random_tensors("superpoint", 5)
     with pytest.raises(DataError, match=r"a\.pth: .*convPa\.bias"):
-        superpoint_with_descriptor(parts(weights, *BACKBONE), weights, **FILES)
+        combined(parts(weights, *BACKBONE), weights, tmp_path)
     for wrong in (
         parts(weights, "conv4", "convD"),  # half a backbone
         {**parts(weights, "convD"), "scale": torch.ones(1)},
     ):
         with pytest.raises(DataError, match=r"b\.pth: "):
-            superpoint_with_descriptor(weights, wrong, **FILES)
+            combined(weights, wrong, tmp_path)
 
 
 @torch.inference_mode()

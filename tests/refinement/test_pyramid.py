@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from poses import rigid
 
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.warping import PosedImage
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.refinement.pyramid import (
     Appearance,
@@ -25,6 +26,10 @@ CAMERA = Camera("SIMPLE_RADIAL", 320, 240, (250.0, 161.0, 118.5, -0.05))
 DEPTH_CAMERA = Camera("PINHOLE", 160, 120, (130.0, 131.0, 80.0, 60.5))
 HERE = RigidTransform.identity()
 POSE = rigid([0.3, -0.2, 0.5], [1.0, 2.0, -0.5])
+
+
+def lifted_points(camera: Camera, pose: RigidTransform, depth: DepthView) -> DepthPoints:
+    return lift_points(PosedImage(np.zeros((1, 1, 3), np.uint8), camera, pose, depth))
 
 
 def picture(seed: int = 0, width: int = 200, height: int = 150) -> NDArray[np.uint8]:
@@ -92,7 +97,7 @@ def test_gradient_energy_is_that_of_central_differences() -> None:
 
 def test_points_project_to_their_pixels() -> None:
     depth = np.full((240, 320), 4.0, np.float32)
-    lifted = lift_points(CAMERA, POSE, DepthView(CAMERA, depth, HERE))
+    lifted = lifted_points(CAMERA, POSE, DepthView(CAMERA, depth, HERE))
     assert len(lifted.points) > 70_000
     np.testing.assert_allclose(project(CAMERA, POSE, lifted.points), lifted.px, atol=1e-6)
     np.testing.assert_allclose(POSE.apply(lifted.points)[:, 2], 4.0)
@@ -105,7 +110,7 @@ def test_depth_of_another_camera_is_transformed() -> None:
     x = (np.arange(160) + 0.5 - 80.0) / 130.0
     plane = np.broadcast_to(3.0 / (1 - 0.1 * x), (120, 160)).astype(np.float32)
     view = DepthView(DEPTH_CAMERA, plane, image_from_depth)
-    lifted = lift_points(CAMERA, POSE, view)
+    lifted = lifted_points(CAMERA, POSE, view)
     points = (image_from_depth.inverse() @ POSE).apply(lifted.points)
     assert len(points) > 10_000
     np.testing.assert_allclose(points[:, 2], 3.0 + 0.1 * points[:, 0], atol=1e-5)
@@ -116,7 +121,7 @@ def test_edges_and_unknown_depths_give_no_points() -> None:
     depth = np.full((120, 160), 4.0, np.float32)
     depth[:, 80:] = 2.0
     depth[50, 30], depth[60, 30], depth[70, 30], depth[80, 30] = 0.0, np.nan, -1.0, np.inf
-    lifted = lift_points(DEPTH_CAMERA, HERE, DepthView(DEPTH_CAMERA, depth, HERE))
+    lifted = lifted_points(DEPTH_CAMERA, HERE, DepthView(DEPTH_CAMERA, depth, HERE))
     known = np.zeros((120, 160), bool)
     known[tuple((lifted.px[:, ::-1] - 0.5).astype(int).T)] = True
     assert not known[:, 79:81].any() and known[10, 77] and known[10, 82]
@@ -125,10 +130,10 @@ def test_edges_and_unknown_depths_give_no_points() -> None:
 
 
 def test_near_surfaces_hide_far_ones() -> None:
-    far = lift_points(CAMERA, HERE, DepthView(CAMERA, np.full((240, 320), 6.0, np.float32), HERE))
+    far = lifted_points(CAMERA, HERE, DepthView(CAMERA, np.full((240, 320), 6.0, np.float32), HERE))
     small = np.zeros((240, 320), np.float32)
     small[80:160, 100:200] = 2.0
-    near = lift_points(CAMERA, HERE, DepthView(CAMERA, small, HERE))
+    near = lifted_points(CAMERA, HERE, DepthView(CAMERA, small, HERE))
     (far_seen, near_seen), covered = visibility([far, near], CAMERA, HERE)
     assert near_seen.all() and covered.all()
     x, y = far.px.T
@@ -151,7 +156,7 @@ def test_the_strongest_of_each_cell_are_chosen() -> None:
     noise = [np.random.default_rng(k).integers(0, 256, (240, 320, 3), np.uint8) for k in (0, 1)]
     levels = [build_pyramid(each, levels=1)[0] for each in noise]
     depth = DepthView(CAMERA, np.full((240, 320), 4.0, np.float32), HERE)
-    lifted = [lift_points(CAMERA, HERE, depth), lift_points(CAMERA, POSE, depth)]
+    lifted = [lifted_points(CAMERA, HERE, depth), lifted_points(CAMERA, POSE, depth)]
     wanted = [np.ones(len(lifted[0].points), bool), lifted[1].px[:, 0] < 160]
     chosen = choose_points(lifted, levels, wanted, 768)  # cells of 10 px
     for group, level in enumerate(levels):
