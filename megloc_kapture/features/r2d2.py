@@ -16,7 +16,6 @@ from pydantic import Field, model_validator
 from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import (
     Images,
     Level,
@@ -143,11 +142,8 @@ class R2D2Network(nn.Module):
 def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
     """Build the network for inference, with its width inferred from the checkpoint's shapes."""
     first = tensors.get("ops.0.weight")
-    if first is None or first.ndim != 4:
-        raise DataError(
-            "this file does not fit R2D2Network; 1 missing keys: ops.0.weight", path=where
-        )
-    return load_strictly(R2D2Network(base_width=len(first)), tensors, where).eval()
+    network = R2D2Network() if first is None else R2D2Network(base_width=len(first))
+    return load_strictly(network, tensors, where).eval()
 
 
 def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:

@@ -38,6 +38,7 @@ CITYSCAPES_CLASSES = (
     *("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"),
 )
 CITYSCAPES_DYNAMIC = frozenset(CITYSCAPES_CLASSES[11:])
+_MAX_SIZE_PX = 2048  # larger images are reduced to this longer side, that of Cityscapes
 _WIDTH = 256
 _LOW_LEVEL_WIDTH = 48
 _DILATIONS = (6, 12, 18)
@@ -58,12 +59,6 @@ class DeepLabOptions(NetworkOptions):
         description="deeplabv3plus-resnet101, deeplabv3plus-mobilenet, or a file; the backbone "
         "is recognized by its parameter names",
     )
-    max_size_px: int = Field(
-        default=2048,
-        ge=64,
-        description="larger images are reduced to this longer side (2048 in Cityscapes), which "
-        "limits the memory",
-    )
 
 
 class DeepLab(Checkpointed[DeepLabOptions]):
@@ -77,7 +72,7 @@ class DeepLab(Checkpointed[DeepLabOptions]):
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return labels uint8 (H, W), indices into ``classes``, of an RGB image uint8 (H, W, 3)."""
         height, width = image.shape[:2]
-        size = reduced_size(width, height, self.options.max_size_px)
+        size = reduced_size(width, height, _MAX_SIZE_PX)
         if size != (width, height):
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         network, device = self.network(_deeplab)

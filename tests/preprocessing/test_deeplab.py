@@ -11,6 +11,7 @@ from published import published_shapes, random_state
 from torch.nn import functional as F
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.preprocessing import deeplab as module
 from megloc_kapture.preprocessing.deeplab import (
     Backbone,
     DeepLab,
@@ -24,8 +25,8 @@ from megloc_kapture.preprocessing.deeplab import (
 PUBLISHED = Path(__file__).parent.parent / "nets" / "data" / "deeplabv3plus"
 
 
-def deeplab(weights: Path, **options: object) -> DeepLab:
-    return DeepLab(DeepLabOptions(weights=str(weights), device="cpu", **options))
+def deeplab(weights: Path) -> DeepLab:
+    return DeepLab(DeepLabOptions(weights=str(weights), device="cpu"))
 
 
 def test_labels_equal_the_published_network_at_the_size_of_the_image(tmp_path: Path) -> None:
@@ -47,10 +48,11 @@ def test_a_large_image_is_reduced_before_the_network(
 
     network = classes_by_brightness, torch.device("cpu")
     monkeypatch.setattr(DeepLab, "network", lambda *_: network)
+    monkeypatch.setattr(module, "_MAX_SIZE_PX", 64)
     (tmp_path / "any.pth").touch()
     image = np.zeros((80, 128, 3), np.uint8)
     image[:, 50:] = 255
-    labels = deeplab(tmp_path / "any.pth", max_size_px=64).segment(image)
+    labels = deeplab(tmp_path / "any.pth").segment(image)
     assert labels.shape == (80, 128)
     assert (labels[:, :48] == 1).all() and (labels[:, 52:] == 0).all()
 
