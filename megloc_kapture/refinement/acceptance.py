@@ -19,7 +19,7 @@ from megloc_kapture.refinement.photometric import (
     LevelProblem,
     NormalEquations,
 )
-from megloc_kapture.refinement.pyramid import Appearance, ChosenPoints
+from megloc_kapture.refinement.pyramid import Appearance
 from megloc_kapture.values import Options, RigidTransform
 
 # squared Mahalanobis distance of two poses above which they differ significantly: chi-squared
@@ -185,7 +185,7 @@ def compare_poses(
     sums = np.bincount(problem.cells(new, ~hidden), gained)
     error = float(np.sqrt(np.square(sums).sum()))
     costs = [problem.system_of(each, squared_scale).mean_cost / squared_scale for each in rows]
-    correlations = [_correlation(each, problem.chosen, problem.num_groups) for each in rows]
+    correlations = [correlation(problem, each) for each in rows]
     return {
         "cost_before": costs[0],
         "cost_after": costs[1],
@@ -201,15 +201,12 @@ def _losses(rows: Float64, squared_scale: float) -> Float64:
     return np.asarray(0.5 * squared / (1.0 + squared))
 
 
-def correlation(problem: LevelProblem, at: Alignment) -> float:
-    return _correlation(problem.rows(at), problem.chosen, problem.num_groups)
-
-
-def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:
-    seen = ~np.isnan(rows[:, 0, 0])
+def correlation(problem: LevelProblem, rows: Float64) -> float:
+    """Return the correlation of query and reference values by ``rows`` of the problem."""
+    chosen, seen = problem.chosen, ~np.isnan(rows[:, 0, 0])
     query, reference, groups = rows[seen][..., 7], chosen.values[seen], chosen.groups[seen]
     product, query_square, reference_square = 0.0, 0.0, 0.0
-    for group in range(num_groups):
+    for group in range(problem.num_groups):
         ours = groups == group
         if not ours.any():
             continue

@@ -125,14 +125,13 @@ def refine_by_icp(
     query_points: Floats,
     map_points: Floats,
     cam_from_world: RigidTransform,
-    options: IcpOptions | None = None,
+    options: IcpOptions,
 ) -> PoseRefinement:
     """Fit a query's points (N, 3), in the camera frame, to the map's (M, 3), float64 in metres.
 
     ``measures`` of the result: residuals are median distances from the map's planes within
     ``max_distances_m[0]``, overlaps the shares of points within ``max_distances_m[-1]``.
     """
-    options = options or IcpOptions()
     # move the origin to the camera, so that coordinates are small
     center = cam_from_world.center()
     local_from_cam = RigidTransform(cam_from_world.inverse().quat_wxyz, (0.0, 0.0, 0.0))

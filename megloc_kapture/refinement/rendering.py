@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -156,7 +155,7 @@ class RenderingRefinement:
         here = minimise(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
         starts = [here, *perturbed_starts(fewer, here)[:_MAX_STARTS]]
         tried = [minimise(fewer, each, last_step_px=_COARSE_STEP_PX, rounds=1) for each in starts]
-        return max(tried, key=partial(correlation, fewer)).cam_from_world
+        return max(tried, key=lambda at: correlation(fewer, fewer.rows(at))).cam_from_world
 
     def _decide(self, old_overlap: float, candidate: Candidate | None) -> PoseRefinement:
         if candidate is None:
