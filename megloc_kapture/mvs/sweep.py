@@ -276,12 +276,10 @@ def matching_deviations(
 def _compared(reference: StereoView, sources: Sequence[StereoView]) -> tuple[Image, Floats, Floats]:
     projections = [relative_projection(reference, source) for source in sources]
     infinities, baselines = (np.array(each) for each in zip(*projections, strict=True))
-    return _stacked([stereo_image(source) for source in sources]), infinities, baselines
-
-
-def _stacked(images: Sequence[Image]) -> Image:
+    # sources may differ in size
+    images = [stereo_image(source) for source in sources]
     height, width = np.max([image.shape for image in images], axis=0)
     stacked = np.full((len(images), height, width), np.nan, np.float32)
     for image, place in zip(images, stacked, strict=True):
         place[: image.shape[0], : image.shape[1]] = image
-    return stacked
+    return stacked, infinities, baselines

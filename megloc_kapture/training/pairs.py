@@ -97,10 +97,9 @@ class PosedPairs:
             named = ((self._names[i], self._names[j]) for i, j in near)
             scored = zip(named, overlaps, strict=True)
             write_pairs(measured, [ImagePair(*names, float(share)) for names, share in scored])
-        self._bins = [
-            near[(overlaps >= low) & (overlaps < high)] for low, high in pairwise(_OVERLAP_BINS)
-        ]
-        self._bins = [pairs for pairs in self._bins if len(pairs)]
+        bounds = pairwise(_OVERLAP_BINS)
+        bins = (near[(overlaps >= low) & (overlaps < high)] for low, high in bounds)
+        self._bins = [pairs for pairs in bins if len(pairs)]
         if not self._bins:
             raise DataError(
                 f"no pair of images overlaps by {_OVERLAP_BINS[0]:g} to "
