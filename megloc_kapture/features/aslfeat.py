@@ -7,11 +7,13 @@ names, written in torch's notation (``scripts/convert_weights.py``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import nn
 from torch.nn import functional
@@ -22,6 +24,7 @@ from megloc_kapture.features.network import (
     LocalNetwork,
     LocalNetworkOptions,
     Masks,
+    in_image_px,
 )
 from megloc_kapture.nets.runtime import batch_counters, in_fast_layout, inference, load_strictly
 from megloc_kapture.nets.score_maps import (
@@ -45,14 +48,28 @@ _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
 # the score map is computed in strips of at most this many activations, to bound memory
 _VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
-# as in the authors' code; the ratio is that of the score map's principal curvatures at a keypoint
-_BORDER_PX, _NMS_RADIUS, _MAX_EDGE_RATIO = 5, 1, 10.0
+_BORDER_PX = 5
 _NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.float32), torch.zeros(0, DESCRIPTOR_SIZE))
+_SCALE_STEP = math.sqrt(0.5)
+_SMALLEST_SCALE = 0.3
+_SMALLEST_SIDE_PX = 128
+_BLUR_PX = 0.8  # Gaussian sigma before each step, in pixels of the smaller image
 
 
 class AslFeatOptions(LocalNetworkOptions):
     weights: str = Field(default="aslfeat", description="name in the registry, or a file")
     threshold: float = Field(default=0.5, ge=0, description="smallest score of a keypoint")
+    nms_radius: int = Field(default=1, ge=0, description="pixels")
+    max_edge_ratio: float = Field(
+        default=10.0,
+        ge=1,
+        description="largest ratio of the score map's principal curvatures at a keypoint",
+    )
+    multi_scale: bool = Field(
+        default=False,
+        description="also extract at 1/sqrt(2) and 1/2 of the image size, to match images of "
+        "different scale; small images have fewer scales",
+    )
 
 
 class AslFeat(LocalNetwork[AslFeatOptions]):
@@ -65,24 +82,30 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
         grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
         # in a uniform image the network would respond only to its zero padding
         usable = [k for k, gray in enumerate(grays) if gray.min() != gray.max()]
-        levels = [_NOTHING] * len(images)
-        if usable and min(grays[0].shape) > 2 * _BORDER_PX:
+        of_image = [_scales(grays[k]) if self.options.multi_scale else [grays[k]] for k in usable]
+        levels_of: list[list[Level]] = [[] for _ in images]
+        for levels in zip(*of_image, strict=True):
+            if min(levels[0].shape) <= 2 * _BORDER_PX:
+                continue
             net, device = self.network(aslfeat_from)
-            stacked = torch.from_numpy(np.stack([grays[k] for k in usable]))[:, None].to(device)
+            stacked = torch.from_numpy(np.stack(levels))[:, None].to(device)
             with inference(device, self.options.half_precision):
                 maps = net(stacked)
             for k, scores, features in zip(usable, *maps, strict=True):
-                levels[k] = self._selected(scores, features)
-        return self._best_of_levels([[level] for level in levels], masks)
+                levels_of[k].append(self._selected(scores, features, images[0].shape))
+        return self._best_of_levels([levels or [_NOTHING] for levels in levels_of], masks)
 
-    def _selected(self, score_map: torch.Tensor, features: torch.Tensor) -> Level:
+    def _selected(
+        self, score_map: torch.Tensor, features: torch.Tensor, full_size: Sequence[int]
+    ) -> Level:
+        options = self.options
         with inference(score_map.device):
             pixels, of_pixels = select_pixels(
-                suppress_non_maxima(score_map, _NMS_RADIUS, rounds=0),
-                threshold=self.options.threshold,
+                suppress_non_maxima(score_map, options.nms_radius, rounds=0),
+                threshold=options.threshold,
                 border=_BORDER_PX,
             )
-            kept = on_no_edge(score_map, pixels, _MAX_EDGE_RATIO)
+            kept = on_no_edge(score_map, pixels, options.max_edge_ratio)
             xy = parabola_peak(score_map, pixels[kept])
             scores = of_pixels[kept]
             coarse = features.shape[1], features.shape[2]
@@ -90,10 +113,22 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
             # _BORDER_PX keeps keypoints inside the descriptor map
             read = read_bilinear(pixel_table(features), y, x, coarse)
             descriptors = functional.normalize(read, dim=1)
-        # the first pixel's centre is (0, 0) in the network, (0.5, 0.5) in COLMAP
-        xy_px = xy.cpu().numpy() + np.float32(0.5)
+        xy_px = in_image_px(xy.cpu().numpy(), score_map.shape, full_size)
         values = scores.cpu().numpy()
         return np.column_stack([xy_px, values]), values, descriptors
+
+
+def _scales(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    smallest = max(_SMALLEST_SCALE, _SMALLEST_SIDE_PX / max(gray.shape))
+    number = math.floor(max(math.log(smallest) / math.log(_SCALE_STEP), 1))
+    levels = [gray]
+    for _ in range(number - 1):
+        blurred = cv2.GaussianBlur(levels[-1], (0, 0), _BLUR_PX / _SCALE_STEP)
+        height, width = (round(side * _SCALE_STEP) for side in blurred.shape)
+        # pass the size: given a factor, OpenCV samples as if the size were not rounded
+        resized = cv2.resize(blurred, (width, height))
+        levels.append(np.asarray(resized, dtype=np.float32))
+    return levels
 
 
 class AslFeatNet(nn.Module):

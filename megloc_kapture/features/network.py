@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -72,3 +72,14 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
                 self._best(np.concatenate(tables), np.concatenate(scores), rows_of, mask)
             )
         return features
+
+
+def in_image_px(
+    xy: NDArray[Any], size: Sequence[int], image_size: Sequence[int]
+) -> NDArray[np.float32]:
+    """Convert positions (N, 2) in a score map to image pixels.
+
+    The centre of the first pixel is (0, 0) in the map, (0.5, 0.5) in the image.
+    """
+    ratio = np.array([image_size[1] / size[1], image_size[0] / size[0]])
+    return ((xy + 0.5) * ratio).astype(np.float32)

@@ -22,6 +22,7 @@ from megloc_kapture.features.network import (
     LocalNetwork,
     LocalNetworkOptions,
     Masks,
+    in_image_px,
 )
 from megloc_kapture.nets.runtime import image_tensor, in_fast_layout, inference, load_strictly
 from megloc_kapture.nets.score_maps import window_maximum
@@ -74,7 +75,6 @@ class R2D2(LocalNetwork[R2D2Options]):
         # channels last is twice as fast on a CPU
         network, device = self.network(load_r2d2, channels_last=True)
         levels_of: list[list[Level]] = [[] for _ in images]
-        height, width = images[0].shape[:2]
         with inference(device, options.half_precision):
             levels = pyramid_levels(
                 torch.cat([image_tensor(image, device) for image in images]),
@@ -83,8 +83,7 @@ class R2D2(LocalNetwork[R2D2Options]):
             )
             for level in levels:
                 outputs = network(in_fast_layout(level))
-                scale = np.float32(_PATCH_PX * max(height, width) / max(level.shape[-2:]))
-                ratio = np.array([width / level.shape[-1], height / level.shape[-2]])
+                scale = np.float32(_PATCH_PX * max(images[0].shape[:2]) / max(level.shape[-2:]))
                 for of_image, features, reliability, repeatability in zip(
                     levels_of, *outputs, strict=True
                 ):
@@ -94,8 +93,7 @@ class R2D2(LocalNetwork[R2D2Options]):
                         & (reliability >= _MIN_RELIABILITY)
                     ).unbind(1)
                     xy = torch.stack([columns, rows], dim=1).cpu().numpy()
-                    # the first pixel's centre is (0, 0) in the level, (0.5, 0.5) in the image
-                    xy_px = ((xy + 0.5) * ratio).astype(np.float32)
+                    xy_px = in_image_px(xy, level.shape[-2:], images[0].shape)
                     scores = reliability[rows, columns] * repeatability[rows, columns]
                     descriptors = functional.normalize(features[:, rows, columns].float(), dim=0).T
                     table = np.column_stack([xy_px, np.full(len(xy_px), scale)])

@@ -46,6 +46,23 @@ def test_keypoints_equal_tensorflow(image: str, tmp_path: Path) -> None:
     )
 
 
+def test_keypoints_of_all_scales_have_coordinates_of_the_image(
+    monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path
+) -> None:
+    # the score is the brightness, so the spot is detected on every scale
+    def net(gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        features = torch.ones(1, 128, -(-gray.shape[2] // 4), -(-gray.shape[3] // 4))
+        return gray[:, 0] / 255, features
+
+    monkeypatch.setattr(aslfeat.AslFeat, "network", lambda *_: (net, torch.device("cpu")))
+    y, x = np.mgrid[:500, :1000] + 0.5
+    spot = 250 * np.exp(-((x - 700.5) ** 2 + (y - 300.5) ** 2) / (2 * 5.0**2))
+    image = np.repeat(spot.round().astype(np.uint8)[..., None], 3, axis=2)
+    result = extractor(aslfeat_weights, multi_scale=True, threshold=0.4).extract(image)
+    assert len(result.scores) == 3
+    np.testing.assert_allclose(result.keypoints_px[:, :2], [[700.5, 300.5]] * 3, atol=0.1)
+
+
 def tensorflows_variables() -> dict[str, np.ndarray]:
     with np.load(TENSORFLOW / "variables.npz") as written:
         return dict(written)
