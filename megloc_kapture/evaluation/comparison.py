@@ -37,14 +37,13 @@ MIN_RESAMPLED = 6
 class PairedTest:
     """Exact McNemar test of two results at one threshold.
 
-    ``first`` and ``second`` are indices into ``Comparison.evaluations``. ``only_first`` and
-    ``only_second`` are the queries within the threshold in one result only; ``both`` and
-    ``neither`` count the other queries. ``p_adjusted`` is the p-value after Holm's correction for
-    all tests of the comparison.
+    ``first`` and ``second`` are labels. ``only_first`` and ``only_second`` are the queries within
+    the threshold in one result only; ``both`` and ``neither`` count the other queries.
+    ``p_adjusted`` is the p-value after Holm's correction for all tests of the comparison.
     """
 
-    first: int
-    second: int
+    first: str
+    second: str
     threshold: Threshold
     both: int
     neither: int
@@ -62,12 +61,12 @@ class PairedTest:
 class MedianDifference:
     """Median position errors of two results; infinite if half or more queries have no pose.
 
-    ``first`` and ``second`` are indices into ``Comparison.evaluations``. ``low_m`` to ``high_m`` is
-    the 95 % bootstrap interval of ``first_m - second_m``, NaN for fewer than six queries.
+    ``first`` and ``second`` are labels. ``low_m`` to ``high_m`` is the 95 % bootstrap interval of
+    ``first_m - second_m``, NaN for fewer than six queries.
     """
 
-    first: int
-    second: int
+    first: str
+    second: str
     first_m: float
     second_m: float
     low_m: float
@@ -92,21 +91,21 @@ def compare(evaluations: Sequence[Evaluation]) -> Comparison:
     _check_comparable(evaluations)
     names = np.array(evaluations[0].errors.names, dtype=object)
     tables, medians = [], []
-    resampled = [_resampled_medians(e.errors.position_m) for e in evaluations]
-    for i, j in combinations(range(len(evaluations)), 2):
-        for threshold in evaluations[0].thresholds:
-            a, b = (within(evaluations[k].errors, threshold) for k in (i, j))
-            tables.append((i, j, threshold, a, b))
-        first_m, second_m = (evaluations[k].row().median_position_m for k in (i, j))
+    resampled = {e.label: _resampled_medians(e.errors.position_m) for e in evaluations}
+    for first, second in combinations(evaluations, 2):
+        pair = first.label, second.label
+        for threshold in first.thresholds:
+            a, b = within(first.errors, threshold), within(second.errors, threshold)
+            tables.append((pair, threshold, a, b))
+        medians_m = first.row().median_position_m, second.row().median_position_m
         interval_m = float("nan"), float("nan")
         if len(names) >= MIN_RESAMPLED:
-            interval_m = difference_interval(resampled[i], resampled[j])
-        medians.append(MedianDifference(i, j, first_m, second_m, *interval_m))
+            interval_m = difference_interval(*(resampled[label] for label in pair))
+        medians.append(MedianDifference(*pair, *medians_m, *interval_m))
     p_values = [mcnemar(int((a & ~b).sum()), int((b & ~a).sum())) for *_, a, b in tables]
     tests = tuple(
         PairedTest(
-            first=i,
-            second=j,
+            *pair,
             threshold=threshold,
             only_first=tuple(names[a & ~b].tolist()),
             only_second=tuple(names[b & ~a].tolist()),
@@ -115,7 +114,7 @@ def compare(evaluations: Sequence[Evaluation]) -> Comparison:
             p_value=p_value,
             p_adjusted=adjusted,
         )
-        for (i, j, threshold, a, b), p_value, adjusted in zip(
+        for (pair, threshold, a, b), p_value, adjusted in zip(
             tables, p_values, holm(p_values).tolist(), strict=True
         )
     )
@@ -191,14 +190,13 @@ CAUTION = "These figures do not measure accuracy: results that share a mistake a
 class AgreementRow:
     """Agreement of two results in one row of the table.
 
-    ``first`` and ``second`` are indices into ``WithoutTruth.evaluations``. ``within`` has, per
-    threshold, the share of all queries whose two poses differ by at most the threshold.
-    ``median_m`` and ``median_deg`` are medians of the pose differences over the queries with a pose
-    in both results.
+    ``first`` and ``second`` are labels. ``within`` has, per threshold, the share of all queries
+    whose two poses differ by at most the threshold. ``median_m`` and ``median_deg`` are medians of
+    the pose differences over the queries with a pose in both results.
     """
 
-    first: int
-    second: int
+    first: str
+    second: str
     name: str
     num_queries: int
     num_both: int
@@ -254,8 +252,8 @@ def evaluate_without_truth(
     members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
     thresholds = tuple(thresholds or thresholds_from_pairs(benchmark.protocol.thresholds))
     agreement, apart = list[AgreementRow](), []
-    for i, j in combinations(range(len(results)), 2):
-        first, second = results[i].poses, results[j].poses
+    for pair in combinations(results, 2):
+        first, second = (result.poses for result in pair)
         shared = {image: first[image] for image in images if image in first and image in second}
         errors = pose_errors(shared, second, images)
         apart.append(errors)
@@ -264,8 +262,7 @@ def evaluate_without_truth(
             row = recall_row(name, errors, thresholds, members=chosen)
             agreement.append(
                 AgreementRow(
-                    first=i,
-                    second=j,
+                    *(result.label for result in pair),
                     name=name,
                     num_queries=row.num_queries,
                     num_both=int((has_pose[0] & has_pose[1] & chosen).sum()),

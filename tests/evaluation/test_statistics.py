@@ -75,7 +75,7 @@ def test_tests_of_all_thresholds_and_pairs_are_corrected() -> None:
     assert [test.p_adjusted for test in actual.tests] == pytest.approx(expected.tolist())
     for test in actual.tests:
         assert len(test.only_first) + len(test.only_second) + test.both + test.neither == 60
-    assert [(m.first, m.second) for m in actual.medians] == [(0, 1), (0, 2), (1, 2)]
+    assert [(m.first, m.second) for m in actual.medians] == [("A", "B"), ("A", "C"), ("B", "C")]
 
 
 def test_the_interval_of_a_median_difference_covers_the_true_one() -> None:

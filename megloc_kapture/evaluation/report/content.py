@@ -17,7 +17,6 @@ from megloc_kapture.evaluation.comparison import (
     Comparison,
     MedianDifference,
     PairedTest,
-    WithoutTruth,
     inliers_quartiles,
 )
 from megloc_kapture.evaluation.metrics import (
@@ -175,19 +174,17 @@ def format_movement(metres: float, degrees: float) -> str:
     return f"{format_metres(metres)} m, {format_degrees(degrees)} deg"
 
 
-def agreement_sentence(row: AgreementRow, results: WithoutTruth) -> str:
+def agreement_sentence(row: AgreementRow) -> str:
     if not row.num_only_first and not row.num_only_second:
         return "The same queries have a pose in both results."
-    first, second = results.evaluations[row.first].label, results.evaluations[row.second].label
     return (
-        f"Only {first} has a pose for {counted(row.num_only_first, 'query')}, "
-        f"only {second} for {row.num_only_second}."
+        f"Only {row.first} has a pose for {counted(row.num_only_first, 'query')}, "
+        f"only {row.second} for {row.num_only_second}."
     )
 
 
-def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
-    first, second = labels[test.first], labels[test.second]
-    where = f"At {test.threshold},"
+def threshold_sentence(test: PairedTest) -> str:
+    first, second, where = test.first, test.second, f"At {test.threshold},"
     only_first, only_second = len(test.only_first), len(test.only_second)
     if not only_first and not only_second:
         if not test.both:
@@ -199,18 +196,18 @@ def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
     )
 
 
-def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
-    pair = (labels[difference.first], labels[difference.second])
-    medians = (difference.first_m, difference.second_m)
-    lost = [label for label, value in zip(pair, medians, strict=True) if math.isinf(value)]
+def median_sentence(difference: MedianDifference) -> str:
+    medians = {difference.first: difference.first_m, difference.second: difference.second_m}
+    lost = [label for label, value in medians.items() if math.isinf(value)]
     if lost:
         return (
             f"At least half of the queries of {' and of '.join(lost)} have no pose, so there is no "
             "median."
         )
     both = (
-        f"The median position error is {format_metres(medians[0])} m for {pair[0]} and "
-        f"{format_metres(medians[1])} m for {pair[1]}: {_signed(medians[0] - medians[1])} m"
+        "The median position error is "
+        + " and ".join(f"{format_metres(value)} m for {name}" for name, value in medians.items())
+        + f": {_signed(difference.first_m - difference.second_m)} m"
     )
     if math.isnan(difference.low_m):
         return f"{both}; too few queries to tell it from chance."
@@ -220,9 +217,8 @@ def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
 
 
 def comparison_sentences(comparison: Comparison) -> list[str]:
-    labels = [evaluation.label for evaluation in comparison.evaluations]
-    tests = [threshold_sentence(test, labels) for test in comparison.tests]
-    return tests + [median_sentence(median, labels) for median in comparison.medians]
+    tests = [threshold_sentence(test) for test in comparison.tests]
+    return tests + [median_sentence(median) for median in comparison.medians]
 
 
 def method_sentence(comparison: Comparison) -> str:
@@ -326,12 +322,12 @@ def result_table(evaluation: Evaluation) -> DataFrame:
     )
 
 
-def agreement_table(results: WithoutTruth, rows: Iterable[AgreementRow]) -> DataFrame:
+def agreement_table(rows: Iterable[AgreementRow]) -> DataFrame:
     """Return the share of queries whose poses in two results agree."""
     return _frame(
         {
-            "first": _shortened(results.evaluations[row.first].label),
-            "second": _shortened(results.evaluations[row.second].label),
+            "first": _shortened(row.first),
+            "second": _shortened(row.second),
             **_condition(row.name),
             "queries": row.num_queries,
             "both have a pose": row.num_both,

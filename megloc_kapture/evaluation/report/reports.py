@@ -19,10 +19,7 @@ from pydantic import BaseModel
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.comparison import (
     CAUTION,
-    AgreementRow,
     Comparison,
-    MedianDifference,
-    PairedTest,
     WithoutTruth,
     inliers_quartiles,
 )
@@ -137,19 +134,14 @@ def _facts_without_truth(reported: WithoutTruth) -> list[_Fact]:
             "% of all queries whose poses in both results are at most "
             f"{content.bounds(reported.thresholds)} apart"
         )
-        facts.append((heading, content.agreement_table(reported, rows)))
-        facts.append((content.agreement_sentence(rows[-1], reported), None))
+        facts.append((heading, content.agreement_table(rows)))
+        facts.append((content.agreement_sentence(rows[-1]), None))
     return facts
 
 
 def report_data(reported: Reported) -> dict[str, Any]:
     if isinstance(reported, Evaluation):
         return _recall_data(reported)
-    labels = [evaluation.label for evaluation in reported.evaluations]
-
-    def named(row: AgreementRow | PairedTest | MedianDifference) -> dict[str, Any]:
-        return {**asdict(row), "first": labels[row.first], "second": labels[row.second]}
-
     if isinstance(reported, WithoutTruth):
         return {
             "statement": reported.statement,
@@ -158,7 +150,7 @@ def report_data(reported: Reported) -> dict[str, Any]:
                 {"label": evaluation.label, "rows": _counts(evaluation)}
                 for evaluation in reported.evaluations
             ],
-            "agreement": [named(row) for row in reported.agreement],
+            "agreement": reported.agreement,
         }
     assert isinstance(reported, Comparison)
     return {
@@ -166,8 +158,8 @@ def report_data(reported: Reported) -> dict[str, Any]:
         "comparison": {
             "method": content.method_sentence(reported),
             "sentences": content.comparison_sentences(reported),
-            "tests": [{**named(test), "real": test.is_real} for test in reported.tests],
-            "medians": [{**named(median), "real": median.is_real} for median in reported.medians],
+            "tests": [{**asdict(test), "real": test.is_real} for test in reported.tests],
+            "medians": [{**asdict(median), "real": median.is_real} for median in reported.medians],
         },
     }
 
