@@ -297,7 +297,6 @@ def _counted(
         rows=recall_rows(queries, errors, (), members),
         members=members,
         queries=queries,
-        estimated=result.poses,
         without_truth=(),
         not_scored=(),
         context=result.context,

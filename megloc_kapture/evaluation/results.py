@@ -30,6 +30,7 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import named
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.io.tables import ConsistencyRow
+from megloc_kapture.stages import paths
 from megloc_kapture.values import (
     Camera,
     Failure,
@@ -42,14 +43,8 @@ from megloc_kapture.values import (
 Read = TypeVar("Read")
 Poses = Mapping[str, RigidTransform]
 
-# parts of a workspace, the preferred map first
-_MAPS = ("map", "preprocessed/mapping", "mapping")
-_QUERY, _QUERY_MATCHES = "query", "matches/query"
-_QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
 _SENSORS = "sensors/sensors.txt"
 _MODELS = ("images.bin", "images.txt")
-# images prepared for features; keypoints are in their pixels
-_PREPARED = "preprocessed"
 
 
 @dataclass(frozen=True)
@@ -103,21 +98,24 @@ def side_tables_near(result: Path | str) -> Path | None:
 def context_of(result: Path | str, *, mapping: Path | str | None = None) -> ResultContext:
     """Find the data around a result; ``mapping`` replaces the workspace's map."""
     workspace, folder = workspace_of(result), Path(result)
-    features, candidates, maps, side_tables = [], [folder], [], NO_TABLES
+    features, queries, maps, side_tables = [], [folder], [], NO_TABLES
     if workspace is not None:
         # matches of a guided pyramid replace those of pairs with few matches
-        pyramids = [workspace / name for name in (_QUERY_PYRAMID, _MAPPING_PYRAMID)]
-        features = [workspace, *filter(Path.is_dir, pyramids), workspace / _QUERY_MATCHES]
-        candidates = [workspace / _PREPARED / _QUERY, workspace / _QUERY, folder]
-        maps = [workspace / name for name in _MAPS]
+        pyramids = [workspace / name for name in (paths.QUERY_PYRAMID, paths.MAPPING_PYRAMID)]
+        features = [workspace, *filter(Path.is_dir, pyramids), workspace / paths.QUERY_MATCHES]
+        # keypoints are in the pixels of the preprocessed images
+        prepared = workspace / paths.PREPROCESSED
+        queries = [prepared / paths.QUERY, workspace / paths.QUERY, folder]
+        maps = [workspace / paths.MAP, prepared / paths.MAPPING, workspace / paths.MAPPING]
         side_tables = read_side_tables(workspace / SIDE_TABLES)
-    queries = next((path for path in candidates if (path / _SENSORS).is_file()), None)
-    map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
-    if mapping is not None:
-        map_path = Path(mapping)
+
+    def first(folders: Sequence[Path]) -> KaptureFolder | None:
+        path = next((path for path in folders if (path / _SENSORS).is_file()), None)
+        return None if path is None else KaptureFolder(path, features_dirs=features)
+
     return ResultContext(
-        queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
-        mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
+        queries=first(queries),
+        mapping=KaptureFolder(mapping, features_dirs=features) if mapping else first(maps),
         frames={image: g.frame for image, g in side_tables.groups.items() if g.frame},
         refinements=_if_there(_read_refinement, folder / tables.REFINEMENT_FILE) or {},
         consistency=read_records(folder / tables.CONSISTENCY_FILE, ConsistencyRow, missing_ok=True),

@@ -131,7 +131,6 @@ class Evaluation(Reported):
     rows : recall per condition, per pool, and of ``"all"``, which is the last.
     members : row name -> mask (N,) of its queries.
     queries : N counted queries, sorted by name.
-    estimated : ``cam_from_world`` of counted queries.
     without_truth : images or pairs without a true pose, sorted; reported but not counted.
     not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
     truth_known_by : note on who has the true poses, if they are not published; else empty.
@@ -149,7 +148,6 @@ class Evaluation(Reported):
     rows: tuple[RecallRow, ...]
     members: Mapping[str, NDArray[np.bool_]]
     queries: tuple[QueryResult, ...]
-    estimated: Poses
     without_truth: tuple[str, ...]
     not_scored: tuple[str, ...]
     truth_known_by: str = ""
@@ -255,14 +253,12 @@ def evaluate_poses(
         )
     )
     members = row_members([query.condition for query in queries], benchmark.protocol)
-    estimated = {name: result.poses[name] for name in counted if name in result.poses}
     return Evaluation(
         label=result.label,
         thresholds=thresholds,
         rows=recall_rows(queries, errors, thresholds, members),
         members=members,
         queries=queries,
-        estimated=estimated,
         covariance=_check_covariances(queries, result, truth),
         nowhere=tuple(
             query_result(result, name, conditions, (np.inf, np.inf)) for name in sorted(nowhere)

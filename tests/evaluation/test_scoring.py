@@ -43,7 +43,8 @@ def test_every_true_query_is_counted_once(world: Any) -> None:
     assert row.num_fallback == outcomes.count("fallback") == 4
     assert row.num_missing == outcomes.count("missing") == 4
     assert evaluation.row("day").num_queries + evaluation.row("night").num_queries == 40
-    assert list(evaluation.estimated) == sorted(world.estimated)
+    posed = [q.name for q in evaluation.queries if q.cam_from_world is not None]
+    assert posed == sorted(world.estimated)
     with pytest.raises(KeyError):
         evaluation.row("noon")
     # in whatever order they come
@@ -81,8 +82,7 @@ def test_share_of_errors_within_covariances(times: float, low: float, high: floa
 def test_images_without_truth_are_not_counted() -> None:
     evaluation = evaluate_poses({"b": HERE, "x": HERE, "c": HERE}, {"a": HERE, "b": HERE})
     assert evaluation.without_truth == ("c", "x")
-    assert evaluation.row().num_queries == 2
-    assert "x" not in evaluation.estimated
+    assert [q.name for q in evaluation.queries] == ["a", "b"]
     truth = {"a": HERE, "b": HERE, "c": HERE}
     evaluation = evaluate_poses({"a": HERE, "unknown": HERE}, truth, scored={"a", "c"})
     assert [q.image for q in evaluation.queries] == ["a", "c"]

@@ -122,7 +122,7 @@ def notes(evaluation: Evaluation) -> list[str]:
         sentences.append(f"{lack} not counted: {_first(missing)}")
         if evaluation.truth_known_by:
             sentences.append(evaluation.truth_known_by.rstrip("."))
-        if not evaluation.estimated and row.num_missing == row.num_queries:
+        if row.num_missing == row.num_queries:
             sentences.append("no estimated image is in the ground truth; the names may not agree")
     if number := len(evaluation.not_scored):
         ignored = counted(number, "image with a true pose is", "images with a true pose are")
@@ -368,7 +368,7 @@ def query_table(evaluation: Evaluation, queries: Sequence[QueryResult]) -> DataF
 
 def refinement_table(evaluation: Evaluation) -> DataFrame | None:
     """Summarize pose refinement, one row per method; None if nothing was refined."""
-    estimated = evaluation.estimated
+    estimated = {q.name for q in evaluation.queries if q.cam_from_world is not None}
     truth = {q.name: q.truth for q in evaluation.queries if q.truth is not None}
     by_method: dict[str, list[tuple[str, PoseRefinement]]] = {}
     for image, steps in sorted(evaluation.context.refinements.items()):

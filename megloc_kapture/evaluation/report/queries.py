@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import Threshold, from_fine_to_coarse
-from megloc_kapture.evaluation.report.content import format_degrees, format_metres
+from megloc_kapture.evaluation.report.content import format_movement
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.geometry.cameras import project
@@ -37,8 +37,7 @@ def query_facts(query: QueryResult) -> list[str]:
     if query.outcome == "missing":
         facts.append(f"no pose ({query.reason})" if query.reason else "no pose")
     elif not math.isnan(query.position_m):
-        error = f"{format_metres(query.position_m)} m, {format_degrees(query.angle_deg)} deg"
-        facts.append(f"{error} off")
+        facts.append(f"{format_movement(query.position_m, query.angle_deg)} off")
     if query.outcome == "fallback":
         facts.append(f"fallback pose ({query.reason})")
     if query.num_inliers is not None:

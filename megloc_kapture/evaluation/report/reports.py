@@ -179,21 +179,21 @@ def _counts(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
-    confidence, covariance = evaluation.confidence, evaluation.covariance
     by_center = evaluation.by_center
-    return {
+    data = {
         "label": evaluation.label,
         "criterion": content.criterion(evaluation),
         "thresholds": evaluation.thresholds,
         "rows": evaluation.rows,
         "notes": content.notes(evaluation),
-        **({} if confidence is None else {"confidence": confidence}),
+        "confidence": evaluation.confidence,
         "rows_above_min_confidence": evaluation.rows_above(MIN_CONFIDENCE),
-        **({} if covariance is None else {"covariance": covariance}),
+        "covariance": evaluation.covariance,
         "without_truth": evaluation.without_truth,
         "not_scored": evaluation.not_scored,
-        **({} if by_center is None else {"rows_by_center": by_center.rows}),
+        "rows_by_center": None if by_center is None else by_center.rows,
     }
+    return {name: value for name, value in data.items() if value is not None}
 
 
 def plain(data: Any) -> Any:
