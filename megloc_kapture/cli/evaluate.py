@@ -79,22 +79,17 @@ class Evaluate(Common):
         repeated = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
         check_option(repeated is None, f"{repeated} is given twice")
         benchmark = benchmark_near(
-            [self.gt, *self.input], side_tables=self.side_tables, dataset=self.dataset
+            [self.gt, *self.input],
+            side_tables=self.side_tables,
+            dataset=self.dataset,
+            thresholds=[Threshold.parse(text) for text in self.thresholds],
         )
-        thresholds = [Threshold.parse(text) for text in self.thresholds] or None
         reported: Reported
         if self.gt is None:
-            reported = results_without_truth(
-                self.input, benchmark, thresholds=thresholds, mapping=self.map
-            )
+            reported = results_without_truth(self.input, benchmark, mapping=self.map)
         else:
             evaluations = evaluate_results(
-                self.input,
-                self.gt,
-                benchmark,
-                thresholds=thresholds,
-                mapping=self.map,
-                align=self.align,
+                self.input, self.gt, benchmark, mapping=self.map, align=self.align
             )
             reported = compare(evaluations) if len(evaluations) > 1 else evaluations[0]
         if self.output is not None:

@@ -236,12 +236,11 @@ def evaluate_without_truth(
     benchmark: SideTables = NO_TABLES,
     *,
     queries: Collection[str] | None = None,
-    thresholds: Sequence[Threshold] | None = None,
 ) -> WithoutTruth:
     """Count localized queries, and compare the results. All poses must be in one coordinate frame.
 
-    By default, ``queries`` are all images of the results. ``thresholds`` apply to the pose
-    differences of two results.
+    By default, ``queries`` are all images of the results. The benchmark's thresholds apply to the
+    pose differences of two results.
     """
     labels = [result.label for result in results]
     if not results or len(set(labels)) != len(labels):
@@ -250,7 +249,7 @@ def evaluate_without_truth(
     require(images, "no query: the results name no image")
     conditions = benchmark.conditions(images)
     members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
-    thresholds = tuple(thresholds or thresholds_from_pairs(benchmark.protocol.thresholds))
+    thresholds = thresholds_from_pairs(benchmark.protocol.thresholds)
     agreement, apart = list[AgreementRow](), []
     for pair in combinations(results, 2):
         first, second = (result.poses for result in pair)

@@ -98,18 +98,14 @@ def evaluate(
     align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
     """
     check_option(align in get_args(Align), f"align is {align!r}; give none, se3 or sim3")
-    benchmark = benchmark_near([truth, estimated], side_tables=side_tables, dataset=dataset)
-    labels = None if label is None else [label]
     given = () if thresholds is None else thresholds
     bounds = [_threshold(each) for each in ([given] if isinstance(given, str) else given)]
+    benchmark = benchmark_near(
+        [truth, estimated], side_tables=side_tables, dataset=dataset, thresholds=bounds
+    )
+    labels = None if label is None else [label]
     return evaluate_results(
-        [estimated],
-        truth,
-        benchmark,
-        thresholds=bounds or None,
-        mapping=mapping,
-        labels=labels,
-        align=align,
+        [estimated], truth, benchmark, mapping=mapping, labels=labels, align=align
     )[0]
 
 
@@ -121,15 +117,26 @@ def _threshold(given: Any) -> Threshold:
 
 
 def benchmark_near(
-    paths: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
+    paths: Sequence[object],
+    *,
+    side_tables: Path | str | None = None,
+    dataset: str | None = None,
+    thresholds: Sequence[Threshold] = (),
 ) -> SideTables:
-    """Return the benchmark of ``side_tables``, or of the first path that is in a workspace."""
+    """Return the benchmark of ``side_tables``, or of the first path that is in a workspace.
+
+    ``thresholds``, if any, replace those of its protocol.
+    """
     if side_tables is not None:
         check_tables(side_tables)
     for path in paths:
         if isinstance(path, Path | str):
             side_tables = side_tables or side_tables_near(path)
-    return benchmark_of(side_tables, dataset)
+    benchmark = benchmark_of(side_tables, dataset)
+    if not thresholds:
+        return benchmark
+    pairs = tuple((threshold.position_m, threshold.angle_deg) for threshold in thresholds)
+    return replace(benchmark, protocol=benchmark.protocol.model_copy(update={"thresholds": pairs}))
 
 
 def evaluate_results(
@@ -137,7 +144,6 @@ def evaluate_results(
     truth: Path | str | Poses,
     benchmark: SideTables,
     *,
-    thresholds: Sequence[Threshold] | None = None,
     mapping: Path | str | None = None,
     labels: Sequence[str] | None = None,
     align: Align = "none",
@@ -168,17 +174,12 @@ def evaluate_results(
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
         true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)
     if relative:
-        return [
-            evaluate_pairs(result, true_poses, benchmark, references, thresholds=thresholds)
-            for result in read
-        ]
+        return [evaluate_pairs(result, true_poses, benchmark, references) for result in read]
     true_poses, read = _by_common_names(true_poses, read, {*nowhere, *benchmark.names})
     evaluations = []
     for result in read:
         aligned, note = _aligned(result, true_poses, align)
-        evaluation = evaluate_poses(
-            aligned, true_poses, benchmark, thresholds=thresholds, nowhere=nowhere
-        )
+        evaluation = evaluate_poses(aligned, true_poses, benchmark, nowhere=nowhere)
         evaluations.append(replace(evaluation, alignment=note))
     return evaluations
 
@@ -187,7 +188,6 @@ def results_without_truth(
     results: Sequence[Localized],
     benchmark: SideTables,
     *,
-    thresholds: Sequence[Threshold] | None = None,
     mapping: Path | str | None = None,
     labels: Sequence[str] | None = None,
 ) -> WithoutTruth:
@@ -212,7 +212,7 @@ def results_without_truth(
     if not queries:
         of_results = {image for result in read for image in result.images}
         queries = benchmark.scored(known | of_results)
-    return evaluate_without_truth(read, benchmark, queries=queries, thresholds=thresholds)
+    return evaluate_without_truth(read, benchmark, queries=queries)
 
 
 def _read(

@@ -200,10 +200,7 @@ class Evaluation(Reported):
         return compare([self, *others])
 
     def row(self, name: str = "all") -> RecallRow:
-        for row in self.rows:
-            if row.name == name:
-                return row
-        raise KeyError(name)
+        return {row.name: row for row in self.rows}[name]
 
 
 def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
@@ -226,7 +223,6 @@ def evaluate_poses(
     truth: Poses,
     benchmark: SideTables = NO_TABLES,
     *,
-    thresholds: Sequence[Threshold] | None = None,
     nowhere: Collection[str] = (),
 ) -> Evaluation:
     """Return errors, outcomes and recall of a result.
@@ -243,7 +239,7 @@ def evaluate_poses(
         counted,
         "no query with a true pose counts in this benchmark: is this the right ground truth?",
     )
-    thresholds = tuple(thresholds or thresholds_from_pairs(benchmark.protocol.thresholds))
+    thresholds = thresholds_from_pairs(benchmark.protocol.thresholds)
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
     queries = tuple(
@@ -332,12 +328,7 @@ def query_result(
 
 
 def evaluate_pairs(
-    result: Result,
-    truth: Poses,
-    benchmark: SideTables,
-    references: Poses,
-    *,
-    thresholds: Sequence[Threshold] | None = None,
+    result: Result, truth: Poses, benchmark: SideTables, references: Poses
 ) -> Evaluation:
     """Evaluate by MLAD's metric: every pair counts once.
 
@@ -373,7 +364,6 @@ def evaluate_pairs(
             protocol=benchmark.protocol.model_copy(update={"conditions": conditions, "pools": {}}),
             groups={n: ImageGroup(condition=condition_of[p.file]) for n, p in named.items()},
         ),
-        thresholds=thresholds,
     )
     names, has_pose = by_center.errors.names, by_center.errors.has_pose
     posed = [name for name, has in zip(names, has_pose, strict=True) if has]

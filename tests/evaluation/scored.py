@@ -119,5 +119,6 @@ def evaluate_poses(
         for image in {*estimated, *truth, *nowhere}
     }
     result = Result(label, estimated, tuple(sorted(estimated)), **options)
-    benchmark = SideTables(protocol=Protocol(), groups=groups)
-    return scoring.evaluate_poses(result, truth, benchmark, thresholds=thresholds, nowhere=nowhere)
+    limits = {"thresholds": [(t.position_m, t.angle_deg) for t in thresholds]} if thresholds else {}
+    benchmark = SideTables(protocol=Protocol(**limits), groups=groups)
+    return scoring.evaluate_poses(result, truth, benchmark, nowhere=nowhere)

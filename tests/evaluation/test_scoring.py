@@ -127,7 +127,7 @@ def test_the_coarsest_threshold_need_not_be_given_last() -> None:
     assert meanings == ["within 5 m, 10 deg", "within 0.25 m, 2 deg"]
 
 
-THRESHOLDS = thresholds_from_pairs(((0.1, None), (0.2, None), (0.5, None)))
+MLAD = protocol_of("4seasons")
 FILE = "relocalizationFile_recording_a_to_recording_b.txt"
 Poses = dict[str, RigidTransform]
 
@@ -140,9 +140,8 @@ def evaluate_all(
     estimated: Poses, truth: Poses, references: Poses, pairs: list[RelocalizationPair]
 ) -> Any:
     result = Result("", estimated, tuple(estimated))
-    return evaluate_pairs(
-        result, truth, SideTables(relocalization=tuple(pairs)), references, thresholds=THRESHOLDS
-    )
+    benchmark = SideTables(protocol=MLAD, relocalization=tuple(pairs))
+    return evaluate_pairs(result, truth, benchmark, references)
 
 
 @pytest.mark.parametrize(("distance_m", "turn_deg"), [(3.0, 20.0), (50.0, 0.2)])
@@ -177,9 +176,8 @@ def test_mlad_pairs_and_conditions() -> None:
     actual = evaluate_pairs(
         Result("", estimated, tuple(estimated), statuses),
         truth,
-        SideTables(relocalization=tuple(pairs)),
+        SideTables(protocol=MLAD, relocalization=tuple(pairs)),
         references,
-        thresholds=THRESHOLDS,
     )
     assert [row.name for row in actual.rows] == ["town_2", "park_2", "all"]
     assert [row.num_queries for row in actual.rows] == [2, 2, 4]
@@ -218,7 +216,7 @@ def test_pose_files_and_folders_have_equal_figures(tmp_path: Path) -> None:
     pairs = [
         RelocalizationPair(f"reloc_{name[0]}.txt", f"a/{name[2]}00.png", name) for name in names
     ]
-    listed = SideTables(protocol=protocol_of("4seasons"), relocalization=pairs)
+    listed = SideTables(protocol=MLAD, relocalization=pairs)
     write_side_tables(workspace / "megloc", listed)
     files.mkdir()
     for file in ("reloc_b.txt", "reloc_c.txt"):
@@ -232,7 +230,7 @@ def test_pose_files_and_folders_have_equal_figures(tmp_path: Path) -> None:
     folder, submitted = evaluate_results(results, workspace / "query_gt", rules)
     assert folder.row().num_queries == 6 and folder.row().num_missing == 1
     np.testing.assert_allclose(submitted.errors.position_m, folder.errors.position_m, atol=1e-12)
-    assert folder.thresholds == THRESHOLDS
+    assert folder.thresholds == thresholds_from_pairs(MLAD.thresholds)
     # one file of two: the other file's pairs have no pose
     (half,) = evaluate_results(
         [files / "reloc_b.txt"], workspace / "query_gt", rules, mapping=workspace / "mapping"

@@ -18,7 +18,6 @@ from megloc_kapture.evaluation.comparison import (
     inliers_quartiles,
 )
 from megloc_kapture.evaluation.evaluate import results_without_truth
-from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import render_report, report_text
 from megloc_kapture.evaluation.results import Result
@@ -31,7 +30,7 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.tables import write_status
 from megloc_kapture.values import LocalizationResult, RigidTransform
 
-THRESHOLDS = [Threshold(position_m=0.25, angle_deg=2.0), Threshold(position_m=5.0, angle_deg=10.0)]
+THRESHOLDS = ((0.25, 2.0), (5.0, 10.0))
 
 
 def pose_at(x: float, turn_deg: float = 0.0) -> RigidTransform:
@@ -72,8 +71,8 @@ def second() -> Result:
 @pytest.fixture
 def result(first: Result, second: Result) -> WithoutTruth:
     groups = {image: ImageGroup(condition=name) for image, name in CONDITIONS.items()}
-    benchmark = SideTables(protocol=Protocol(truth="Nobody tells."), groups=groups)
-    return evaluate_without_truth([first, second], benchmark, thresholds=THRESHOLDS)
+    rules = Protocol(truth="Nobody tells.", thresholds=THRESHOLDS)
+    return evaluate_without_truth([first, second], SideTables(protocol=rules, groups=groups))
 
 
 def test_counts_and_inliers(result: WithoutTruth) -> None:
@@ -104,7 +103,8 @@ def test_agreement_of_two_results(result: WithoutTruth, first: Result) -> None:
     np.testing.assert_allclose(result.apart[0].position_m, [0.1, 0.0, np.inf, np.inf], atol=1e-12)
     # a result agrees with itself
     twin = Result("twin", first.poses, first.images, first.statuses)
-    (row,) = evaluate_without_truth([first, twin], thresholds=THRESHOLDS).agreement
+    benchmark = SideTables(protocol=Protocol(thresholds=THRESHOLDS))
+    (row,) = evaluate_without_truth([first, twin], benchmark).agreement
     assert [at.num_within for at in row.within] == [3, 3] and row.median_m == 0.0
 
 
