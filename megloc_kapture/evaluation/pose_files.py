@@ -41,8 +41,6 @@ COLUMNS = "name qw qx qy qz tx ty tz"
 
 Value = TypeVar("Value")
 Poses = Mapping[str, RigidTransform]
-RelativePoses = dict[tuple[int, int], RigidTransform | None]
-"""Timestamps of reference and query -> ``query_from_reference``, None if the row has no pose."""
 # a rule, or the challenge's list: image -> name in the pose file, in the list's order
 Names = PoseFileNames | Mapping[str, str]
 
@@ -116,9 +114,7 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
             )
             name = fields[0].replace("\\", "/")
             require(name not in poses, f"{name!r} is given twice")
-            values = [parse_number(field) for field in fields[1:8]]
-            failed = not np.isfinite(values).all() or not any(values[:4])
-            poses[name] = None if failed else parse_pose(fields[1:8], "ltvl", repr(name))
+            poses[name] = _pose_or_none(fields[1:8], "ltvl", repr(name))
     if failures := [name for name, pose in poses.items() if pose is None]:
         message = "%s: %d rows of nan or zeros are read as queries without a pose, such as %s"
         _log.warning(message, path, len(failures), failures[0])
@@ -251,6 +247,14 @@ def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> Rigid
     return checked_pose((qw, qx, qy, qz), (tx, ty, tz), whose)
 
 
+def _pose_or_none(fields: Sequence[str], kind: PoseFileFormat, whose: str) -> RigidTransform | None:
+    """Return None for nan or a zero quaternion, which other tools write for failed queries."""
+    numbers = [parse_number(field) for field in fields]
+    quaternion = numbers[3:] if kind == "mlad" else numbers[:4]
+    failed = not np.isfinite(numbers).all() or not any(quaternion)
+    return None if failed else parse_pose(fields, kind, whose)
+
+
 MLAD_COLUMNS = "src_ts tgt_ts tx ty tz qx qy qz qw"
 # without leading zeros, so that writing the parsed int gives the same text
 _TIMESTAMP = re.compile("0|[1-9][0-9]{0,29}")
@@ -285,30 +289,25 @@ def format_mlad_file(poses: Mapping[tuple[int, int], RigidTransform]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def read_mlad_file(path: Path | str) -> RelativePoses:
-    """Read a pose file or a relocalization file, in file order.
+def read_mlad_file(path: Path | str) -> dict[tuple[int, int], RigidTransform]:
+    """Read ``query_from_reference`` by timestamps of reference and query, in file order.
 
     Rows of nan or zeros, which other tools write for failed queries, become the identity, the mark
     of a missing pose. Commas, CRLF, empty lines and comments are accepted.
     """
-    poses: RelativePoses = {}
-    columns = 0
+    poses: dict[tuple[int, int], RigidTransform] = {}
     with reading_lines(Path(path), comments=True) as lines:
         for fields in map(fields_of, lines):
-            columns = columns or (2 if len(fields) == 2 else 9)
-            if len(fields) != columns:
-                wanted = f"9 ({MLAD_COLUMNS})" if columns == 9 else "2, as in the rows before"
-                raise DataError(f"{len(fields)} columns instead of {wanted}")
+            require(
+                len(fields) == 9,
+                f"{len(fields)} columns instead of 9 ({MLAD_COLUMNS}); relocalization files of "
+                "test recordings have no poses",
+            )
             reference, query = (parse_timestamp(field) for field in fields[:2])
-            whose, pose = f"pair {reference} {query}", None
+            whose = f"pair {reference} {query}"
             require((reference, query) not in poses, f"{whose} is given twice")
-            if columns == 9:
-                values = [parse_number(field) for field in fields[2:]]
-                failed = not np.isfinite(values).all() or not any(values[3:])
-                pose = (
-                    RigidTransform.identity() if failed else parse_pose(fields[2:], "mlad", whose)
-                )
-            poses[reference, query] = pose
+            pose = _pose_or_none(fields[2:], "mlad", whose)
+            poses[reference, query] = pose or RigidTransform.identity()
     return poses
 
 

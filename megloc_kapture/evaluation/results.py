@@ -291,40 +291,39 @@ def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -
 def _read_mlad(
     path: Path, pairs: Sequence[RelocalizationPair], references: Poses, world: World
 ) -> dict[RelocalizationPair, RigidTransform]:
-    if not references:
-        reason = "its poses are relative to the map's images: give the map with --map"
-        raise DataError(reason, path=path)
+    require(
+        references,
+        "its poses are relative to the map's images: give the map with --map",
+        path=path,
+    )
     asked: dict[str, dict[tuple[int, int], RelocalizationPair]] = {}
     for pair in pairs:
         stamps = pose_files.timestamp_of(pair.reference), pose_files.timestamp_of(pair.query)
         asked.setdefault(pair.file, {})[stamps] = pair
-    paths = {path.name if path.name in asked else min(asked): path}
     if path.is_dir():
-        paths = {file: path / file for file in sorted(asked) if (path / file).is_file()}
-        if not paths:
-            raise DataError(
-                f"neither a kapture folder nor one with pose files ({min(asked)})", path=path
-            )
-    elif path.name not in asked and len(asked) > 1:
-        raise DataError(
+        files = {file: path / file for file in sorted(asked) if (path / file).is_file()}
+        names = min(asked)
+        require(files, f"neither a kapture folder nor one with pose files ({names})", path=path)
+    else:
+        files = {path.name if path.name in asked else min(asked): path}
+        require(
+            path.name in asked or len(asked) == 1,
             "cannot tell which relocalization file it belongs to; rename it to one of "
             f"{', '.join(sorted(asked))}",
             path=path,
         )
     poses: dict[RelocalizationPair, RigidTransform] = {}
-    for file, pose_file in paths.items():
+    for file, pose_file in files.items():
         for stamps, pose in pose_files.read_mlad_file(pose_file).items():
             asked_pair = asked[file].get(stamps)
             if asked_pair is None:
                 problem = f"pair {stamps[0]} {stamps[1]} is not in the relocalization file"
                 raise DataError(problem, path=pose_file)
-            if pose is None:
-                raise DataError(
-                    "has pairs without poses, like a relocalization file", path=pose_file
-                )
-            if asked_pair.reference not in references:
-                problem = f"reference {asked_pair.reference!r} has no pose in the map"
-                raise DataError(problem, path=pose_file)
+            require(
+                asked_pair.reference in references,
+                f"reference {asked_pair.reference!r} has no pose in the map",
+                path=pose_file,
+            )
             # the identity marks a missing pose, since the file must have every row
             if pose != RigidTransform.identity():
                 local = pose.scaled(1 / world.official_from_local.scale)

@@ -133,7 +133,6 @@ def test_rows_without_a_pose_are_misses(tmp_path: Path, caplog: pytest.LogCaptur
         (read_mlad_file, GOOD_PAIR, "1e2 206 0 0 0 0 0 0 1", "'1e2' is not a timestamp"),
         (read_mlad_file, GOOD_PAIR, "-100 206 0 0 0 0 0 0 1", "not a timestamp"),
         (read_mlad_file, GOOD_PAIR, "100 205 0 0 0 0 0 0 1", "pair 100 205 is given twice"),
-        (read_mlad_file, "1 2\n", GOOD_PAIR, "9 columns instead of 2"),
     ],
 )
 def test_broken_lines_are_named(

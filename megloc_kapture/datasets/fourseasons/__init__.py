@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from megloc_kapture.datasets.official import Missing, kapture_hint
 from megloc_kapture.errors import DataError, OptionError, require
-from megloc_kapture.evaluation.pose_files import RelativePoses, parse_timestamp
+from megloc_kapture.evaluation.pose_files import parse_timestamp
 from megloc_kapture.io.files import named
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.io.text_lines import fields_of, numbers_of, read_transform, reading_lines
@@ -33,7 +33,8 @@ _RELOCALIZATION_NAMES = (
 )
 
 Row = TypeVar("Row")
-
+# timestamps of reference and query -> ``query_from_reference``, None if the row has no pose
+RelativePoses = dict[tuple[int, int], RigidTransform | None]
 
 # the two cameras by name, each with its cam_from_cam0 in metres
 Calibration = Mapping[str, tuple[Camera, RigidTransform]]
