@@ -263,7 +263,6 @@ class KaptureImage:
 
     name: str
     file: Path
-    timestamp: int
     sensor_id: str
     camera: Camera
     cam_from_world: RigidTransform | None
@@ -319,15 +318,9 @@ class KaptureForm:
                     check_image_size(file, camera)
                     checked.add(sensor_id)
                 pose = data.device_from_world(timestamp, sensor_id)
+                is_query = path.name != MAPPING
                 images[name] = KaptureImage(
-                    name,
-                    file,
-                    timestamp,
-                    sensor_id,
-                    camera,
-                    pose,
-                    path.name != "mapping",
-                    locations,
+                    name, file, sensor_id, camera, pose, is_query, locations
                 )
         return list(images.values())
 

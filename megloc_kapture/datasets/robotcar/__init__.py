@@ -269,22 +269,18 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     for location, path in lists.items():
         for image in read_query_location(path):
             at_time[image.camera, image.timestamp] = image
-            others = locations.get(image, ())
-            if location not in others:
-                locations[image] = (*others, location)
+            locations[image] = (*locations.get(image, ()), location)
     train: dict[ImageKey, RigidTransform] = {}
     test: dict[ImageKey, str] = {}
     unlisted = 0
-    # version 1 does not need the training list
-    wanted = version == 2 and missing.require(layout.train_list)
-    if wanted or layout.train_list.is_file():
-        path = layout.train_list
-        train, unlisted = known_queries(
-            path, read_train_poses(path), at_time, allow_missing=allow_missing
-        )
-    if version == 2 and missing.require(layout.test_list):
-        path = layout.test_list
-        test, more = known_queries(path, read_test_list(path), at_time, allow_missing=allow_missing)
+    if version == 2:
+        missing.require(layout.train_list)  # version 1 does not need it
+    if (path := layout.train_list).is_file():
+        poses = read_train_poses(path)
+        train, unlisted = known_queries(path, poses, at_time, allow_missing=allow_missing)
+    if version == 2 and missing.require(path := layout.test_list):
+        names = read_test_list(path)
+        test, more = known_queries(path, names, at_time, allow_missing=allow_missing)
         unlisted += more
     return Queries(locations, train, test, unlisted)
 
