@@ -99,9 +99,10 @@ class Count:
 
 @dataclass
 class Missing:
-    """Missing files, collected so that a single message reports all."""
+    """Missing files, collected so that a single message reports all, unless they are allowed."""
 
     root: Path
+    allowed: bool = False
     files: list[Path] = field(default_factory=list)
 
     def require(self, file: Path) -> bool:

@@ -95,7 +95,7 @@ class InLoc:
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)
-        layout, missing = Layout.find(root), Missing(root)
+        layout, missing = Layout.find(root), Missing(root, allow_missing)
         map_ = _Map(self.options)
         wrong = {floor: layout.wrong_scans(floor) for floor in self.floors}
         left_out = []
@@ -106,7 +106,7 @@ class InLoc:
                 else:
                     map_.add(scan, missing)
         require(
-            not self.options.depth or not map_.groups or map_.depth or allow_missing,
+            not self.options.depth or not map_.groups or map_.depth or missing.allowed,
             f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
             "them is imported with the option depth = false",
             path=layout.cutouts,

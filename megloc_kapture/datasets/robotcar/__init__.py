@@ -259,7 +259,7 @@ class Queries:
     unlisted: int
 
 
-def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missing: bool) -> Queries:
+def read_queries(layout: Layout, version: int, missing: Missing) -> Queries:
     """Read the lists of queries; public poses are read for both versions, if present."""
     lists = layout.query_lists()
     if not lists:
@@ -276,11 +276,9 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     if version == 2:
         missing.require(layout.train_list)  # version 1 does not need it
     if (path := layout.train_list).is_file():
-        poses = read_train_poses(path)
-        train, unlisted = known_queries(path, poses, at_time, allow_missing=allow_missing)
+        train, unlisted = known_queries(path, read_train_poses(path), at_time, missing)
     if version == 2 and missing.require(path := layout.test_list):
-        names = read_test_list(path)
-        test, more = known_queries(path, names, at_time, allow_missing=allow_missing)
+        test, more = known_queries(path, read_test_list(path), at_time, missing)
         unlisted += more
     return Queries(locations, train, test, unlisted)
 
@@ -289,8 +287,7 @@ def known_queries(
     path: Path,
     entries: Mapping[ImageKey, Value],
     at_time: Mapping[tuple[str, int], ImageKey],
-    *,
-    allow_missing: bool,
+    missing: Missing,
 ) -> tuple[dict[ImageKey, Value], int]:
     """Return the entries of a list of version 2 by query, and the number of entries without one.
 
@@ -301,7 +298,7 @@ def known_queries(
         query = at_time.get((image.camera, image.timestamp))
         if query is not None and image.condition in ("", query.condition):
             values[query] = value
-        elif allow_missing or not at_time:  # without queries_per_location, its files are missing
+        elif missing.allowed or not at_time:  # without queries_per_location, its files are missing
             unlisted += 1
         else:
             raise DataError(

@@ -43,7 +43,7 @@ from megloc_kapture.datasets.robotcar.images import (
     with_images,
     with_rig_of_model,
 )
-from megloc_kapture.errors import check_option, require
+from megloc_kapture.errors import require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
@@ -134,13 +134,11 @@ class RobotCar:
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)
-        missing = Missing(Path(root))
-        options = self.options
-        chosen: dict[str, Any] = {"part": options.queries, "train_as_map": options.train_as_map}
+        missing = Missing(Path(root), allow_missing)
         if (form := _kapture_form(root)) is not None:
-            return self._read_kapture(form, missing, chosen, allow_missing=allow_missing)
+            return self._read_kapture(form, missing)
         layout = Layout(root)
-        version = options.version
+        version = self.options.version
         if version == "auto":
             found = next(find_near(layout.root, layout.test_list.name), None)
             require(
@@ -149,17 +147,23 @@ class RobotCar:
                 path=found,
             )
             version = 1 if found is None else 2
-        self._check_version(version)
-        queries = read_queries(layout, version, missing, allow_missing=allow_missing)
+        queries = read_queries(layout, version, missing)
         wanted = sorted({name for listed in queries.locations.values() for name in listed})
         reference = read_reference(layout, self.options.model, wanted, missing)
         cameras = {camera for camera in CAMERAS if missing.require(layout.intrinsics(camera))}
-        find = image_finder(layout, missing)
-        selection = select(version, *reference, queries, cameras=cameras, find=find, **chosen)
+        selection = select(
+            version,
+            *reference,
+            queries,
+            part=self.options.queries,
+            train_as_map=self.options.train_as_map,
+            cameras=cameras,
+            find=image_finder(layout, missing),
+        )
         remarks: list[str] = []
         model, database = None, None
         if self.options.reference_model:
-            model = partial(_read_points, layout, selection, options.model)
+            model = partial(_read_points, layout, selection, self.options.model)
             database = published_database(layout.feature_database, remarks)
         return self._dataset(
             selection,
@@ -172,20 +176,20 @@ class RobotCar:
             reference_database=database,
         )
 
-    def _read_kapture(
-        self, form: KaptureForm, missing: Missing, chosen: dict[str, Any], *, allow_missing: bool
-    ) -> OfficialDataset:
+    def _read_kapture(self, form: KaptureForm, missing: Missing) -> OfficialDataset:
         images = read_kapture_images(form, missing)
         test_list = Layout(missing.root).test_list
         wanted = None if self.options.version == "auto" else self.options.version
-        version, queries = queries_of_kapture(
-            images, wanted, test_list, allow_missing=allow_missing
-        )
-        self._check_version(version)
+        version, queries = queries_of_kapture(images, wanted, test_list, missing)
         reference, car = reference_of_kapture(images), car_of_kapture(form, images)
-        paths = {key: image.name for key, image in images.items()}
         selection = select(
-            version, *reference, queries, cameras=car.sensors, find=paths.get, **chosen
+            version,
+            *reference,
+            queries,
+            part=self.options.queries,
+            train_as_map=self.options.train_as_map,
+            cameras=car.sensors,
+            find={key: image.name for key, image in images.items()}.get,
         )
         remarks = [f"Read from kapture folders, as version {version}."]
         if version == 2 and not test_list.is_file():
@@ -234,13 +238,6 @@ class RobotCar:
             remarks=[*_remarks(selection), *remarks],
             missing=missing,
             **more,
-        )
-
-    def _check_version(self, version: int) -> None:
-        check_option(
-            version == 2 or not (self.options.train_as_map or self.options.queries != "all"),
-            "the options train_as_map and queries need version 2, but version 1 is imported; "
-            "add robotcar_v2_test.txt, or set version=2",
         )
 
 

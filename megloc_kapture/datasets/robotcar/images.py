@@ -21,7 +21,7 @@ from megloc_kapture.datasets.robotcar import (
     read_intrinsics,
     read_test_list,
 )
-from megloc_kapture.errors import DataError, require
+from megloc_kapture.errors import DataError, check_option, require
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
@@ -72,6 +72,11 @@ def select(
 
     ``part`` limits the queries to moments (condition and time) of version 2's train or test list.
     """
+    check_option(
+        version == 2 or not (train_as_map or part != "all"),
+        "the options train_as_map and queries need version 2, but version 1 is imported; "
+        "add robotcar_v2_test.txt, or set version=2",
+    )
     wanted: Iterable[ImageKey] = queries.locations
     if part != "all":
         wanted = _of_moments(wanted, queries.train if part == "train" else queries.test)
@@ -238,11 +243,7 @@ def reference_of_kapture(
 
 
 def queries_of_kapture(
-    images: Mapping[ImageKey, KaptureImage],
-    version: int | None,
-    test_list: Path,
-    *,
-    allow_missing: bool,
+    images: Mapping[ImageKey, KaptureImage], version: int | None, test_list: Path, missing: Missing
 ) -> tuple[int, Queries]:
     """Return the version, detected if None, and the images of all but the reference condition.
 
@@ -260,9 +261,7 @@ def queries_of_kapture(
     unlisted = 0
     if version == 2 and test_list.is_file():
         at_time = {(key.camera, key.timestamp): key for key in keys}
-        test, unlisted = known_queries(
-            test_list, read_test_list(test_list), at_time, allow_missing=allow_missing
-        )
+        test, unlisted = known_queries(test_list, read_test_list(test_list), at_time, missing)
     elif version == 2:
         test = {key: f"{key.camera}/{key.stem}.png" for key in poses if key not in train}
     return version, Queries({key: images[key].locations for key in keys}, train, test, unlisted)
