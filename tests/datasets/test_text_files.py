@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.datasets import fourseasons, robotcar
-from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
+from megloc_kapture.datasets.inloc.adapter import read_transformation, read_wrong_scans
 from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.text_lines import read_camera_rows, read_transform

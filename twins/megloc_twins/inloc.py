@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.io import savemat
 
-from megloc_kapture.datasets.inloc import COLOURS, POINTS
+from megloc_kapture.datasets.inloc.adapter import POINTS
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, SideTables, write_side_tables
 from megloc_kapture.io.files import write_bytes
@@ -153,7 +153,7 @@ def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: Rend
     rng = stream(options.seed, "inloc", "laser", frame.name)
     points = scanned_points(floor, frame.camera, *poses, view.image, rng)
     content = BytesIO()
-    savemat(content, {COLOURS: view.image, POINTS: points}, do_compression=True)
+    savemat(content, {"RGBcut": view.image, POINTS: points}, do_compression=True)
     header = b"MATLAB 5.0 MAT-file".ljust(116)  # SciPy's header contains the date
     write_bytes(root / f"{frame.name}.mat", header + content.getvalue()[len(header) :])
 

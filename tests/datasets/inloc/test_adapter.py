@@ -10,8 +10,7 @@ import pytest
 from inloc_files import write_download
 from PIL import Image
 
-from megloc_kapture.datasets.inloc import read_cutout_points
-from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
+from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions, read_cutout_points
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
