@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.kapture_folders import fitted_camera, is_kapture, warn_of_scaled
+from megloc_kapture.datasets.kapture_folders import fitted_camera, warn_of_scaled
 from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import REPORT_HTML
@@ -34,7 +34,7 @@ from megloc_kapture.io.images import (
     read_photo,
     turned_upright,
 )
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder, is_kapture
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.pipeline.evaluation_plan import choose_run, plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import ExecutorKind, open_executor, single_threaded

@@ -19,7 +19,6 @@ from megloc_kapture.cli.common import (
     print_counts,
 )
 from megloc_kapture.datasets.colmap_map import find_colmap
-from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
@@ -37,7 +36,7 @@ from megloc_kapture.pipeline.export import ExportFormat, export
 from megloc_kapture.pipeline.map_making import import_colmap
 from megloc_kapture.pipeline.presets import options_with, parse_assignments
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
-from megloc_kapture.stages.paths import MAP
+from megloc_kapture.stages.paths import MAP, QUERY
 from megloc_kapture.stages.work import Work
 
 DATASET, COLMAP, MEGADEPTH = "dataset", "colmap", "megadepth"

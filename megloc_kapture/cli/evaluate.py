@@ -31,6 +31,7 @@ from megloc_kapture.io.dataset_tables import (
     read_side_tables,
     tables_of,
 )
+from megloc_kapture.io.kapture import is_kapture
 from megloc_kapture.io.output_folders import check_claim, check_new_file, staged_output
 from megloc_kapture.pipeline.datasets import (
     TWIN_PREFIX,
@@ -42,7 +43,7 @@ from megloc_kapture.pipeline.submission import (
     workspace_provenance,
     write_submission,
 )
-from megloc_kapture.stages.paths import EVALUATION
+from megloc_kapture.stages.paths import EVALUATION, MAPPING
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,8 +199,7 @@ class Check(Common):
         workspaces = [
             path
             for path in sorted(_RUNS.glob(f"{self.dataset}-*"))
-            if (path / "mapping" / "sensors" / "sensors.txt").is_file()
-            and not path.name.startswith(others)
+            if is_kapture(path / MAPPING) and not path.name.startswith(others)
         ]
         if len(workspaces) == 1:
             self.say(f"compared with {workspaces[0]}")

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import cameras_of_images, is_kapture, warn_of_scaled
+from megloc_kapture.datasets.kapture_folders import cameras_of_images, warn_of_scaled
 from megloc_kapture.datasets.reference_map import UNDEFINED, ColmapDatabase, write_reference_map
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import (
@@ -30,6 +30,7 @@ from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
     Sensor,
+    is_kapture,
     writable_name,
     write_sensors,
 )

@@ -22,24 +22,25 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import check_relative, link_images
 from megloc_kapture.io.images import image_size
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import (
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    is_kapture,
+    write_sensors,
+)
 from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.preprocessing.frames import scaled_camera
+from megloc_kapture.stages.paths import MAPPING, QUERY, QUERY_GT
 from megloc_kapture.values import Camera, RigidTransform
 
 _log = logging.getLogger(__name__)
 Key = TypeVar("Key")
 
-MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
-_SENSORS = "sensors/sensors.txt"
 _NO_POSE = (
     "no image has a pose: sensors/trajectories.txt is missing, or has other timestamps or sensors "
     "than records_camera.txt"
 )
-
-
-def is_kapture(folder: Path) -> bool:
-    return (folder / _SENSORS).is_file()
 
 
 def check_root(root: Path) -> Path:
@@ -49,8 +50,8 @@ def check_root(root: Path) -> Path:
     for part in (MAPPING, QUERY):
         require(
             is_kapture(root / part),
-            f"{part}/{_SENSORS} is missing; a dataset of kapture folders has mapping/ and query/, "
-            "and query_gt/ if true poses are known",
+            f"{part}/sensors/sensors.txt is missing; a dataset of kapture folders has mapping/ and "
+            "query/, and query_gt/ if true poses are known",
             path=root,
         )
     return root

@@ -10,14 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
-from megloc_kapture.datasets.kapture_folders import (
-    MAPPING,
-    QUERY,
-    QUERY_GT,
-    check_image_size,
-    is_kapture,
-    tell_of_truth_without_query,
-)
+from megloc_kapture.datasets.kapture_folders import check_image_size, tell_of_truth_without_query
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.colmap_model import SparsePoints
@@ -30,12 +23,12 @@ from megloc_kapture.io.dataset_tables import (
     write_side_tables,
 )
 from megloc_kapture.io.files import find_near, link_records
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, is_kapture, write_sensors
 from megloc_kapture.io.output_folders import ARCHIVES
+from megloc_kapture.stages.paths import MAPPING, QUERY, QUERY_GT, REFERENCE
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 GROUND_TRUTH = "ground_truth"
-REFERENCE = "reference"
 _MISSING_SHOWN = 5
 
 

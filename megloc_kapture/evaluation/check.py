@@ -26,7 +26,8 @@ from megloc_kapture.geometry.poses import (
 )
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, PoseFileFormat, Protocol, SideTables
 from megloc_kapture.io.files import read_text
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder, is_kapture
+from megloc_kapture.stages.paths import MAPPING, QUERY
 from megloc_kapture.values import RigidTransform
 
 # error: the server would reject the file or give wrong results for it; warning: probably a
@@ -133,8 +134,8 @@ def read_reference(folder: Path) -> Reference:
     """Read ``mapping/``, ``query/`` and ``megloc/`` of an imported dataset or workspace."""
     tables = folder / SIDE_TABLES
     mapping, query = (
-        KaptureFolder(path) if (path / "sensors" / "sensors.txt").is_file() else None
-        for path in (folder / "mapping", folder / "query")
+        KaptureFolder(path) if is_kapture(path) else None
+        for path in (folder / MAPPING, folder / QUERY)
     )
     require(
         mapping is not None or query is not None or tables.is_dir(),

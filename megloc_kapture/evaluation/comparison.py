@@ -261,7 +261,8 @@ def evaluate_without_truth(
             row = recall_row(name, errors, thresholds, members=chosen)
             agreement.append(
                 AgreementRow(
-                    *(result.label for result in pair),
+                    first=pair[0].label,
+                    second=pair[1].label,
                     name=name,
                     num_queries=row.num_queries,
                     num_both=int((has_pose[0] & has_pose[1] & chosen).sum()),

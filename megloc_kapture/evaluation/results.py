@@ -28,7 +28,7 @@ from megloc_kapture.io.dataset_tables import (
     unit_of,
 )
 from megloc_kapture.io.files import named
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, is_kapture
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.stages import paths
 from megloc_kapture.values import (
@@ -43,7 +43,6 @@ from megloc_kapture.values import (
 Read = TypeVar("Read")
 Poses = Mapping[str, RigidTransform]
 
-_SENSORS = "sensors/sensors.txt"
 _MODELS = ("images.bin", "images.txt")
 
 
@@ -110,7 +109,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         side_tables = read_side_tables(workspace / SIDE_TABLES)
 
     def first(folders: Sequence[Path]) -> KaptureFolder | None:
-        path = next((path for path in folders if (path / _SENSORS).is_file()), None)
+        path = next((path for path in folders if is_kapture(path)), None)
         return None if path is None else KaptureFolder(path, features_dirs=features)
 
     return ResultContext(
@@ -236,7 +235,7 @@ def _poses_of(data: KaptureData, folder: Path) -> dict[str, RigidTransform]:
 
 def model_of(folder: Path) -> Path | None:
     """Return the COLMAP model in a folder, if any."""
-    if (folder / _SENSORS).is_file():
+    if is_kapture(folder):
         return None
     candidates = (folder, folder / "sparse", folder / "sparse" / "0")
     return next((p for p in candidates for n in _MODELS if (p / n).is_file()), None)

@@ -19,14 +19,10 @@ from typing import Any
 from pydantic import Field, ValidationError, field_validator
 
 from megloc_kapture.datasets.kapture_folders import (
-    MAPPING,
-    QUERY,
-    QUERY_GT,
     check_root,
     checked_folders,
     import_kapture_folders,
     input_files,
-    is_kapture,
 )
 from megloc_kapture.datasets.official import OfficialDataset, check_official, write_official
 from megloc_kapture.errors import (
@@ -41,11 +37,12 @@ from megloc_kapture.errors import (
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder, is_kapture
 from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS
 from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_names
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
+from megloc_kapture.stages.paths import MAPPING, QUERY, QUERY_GT
 from megloc_kapture.values import Options
 
 _log = logging.getLogger(__name__)

@@ -17,7 +17,6 @@ import numpy as np
 from megloc_kapture.datasets.kapture_folders import (
     check_image_size,
     fitted_camera,
-    is_kapture,
     warn_of_scaled,
     with_cameras_of_images,
 )
@@ -41,6 +40,7 @@ from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
     Sensor,
+    is_kapture,
     writable_name,
 )
 from megloc_kapture.io.output_folders import MARKER

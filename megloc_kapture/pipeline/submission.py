@@ -12,7 +12,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, is_kapture
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation.pose_files import (
     format_mlad_file,
@@ -32,10 +31,11 @@ from megloc_kapture.io.dataset_tables import (
     read_unreadable,
 )
 from megloc_kapture.io.files import read_text, safe_join, temporary_name, write_bytes, write_json
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder, is_kapture
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.pipeline.plan import Manifest, read_manifests
 from megloc_kapture.stages import scene
+from megloc_kapture.stages.paths import MAPPING, QUERY
 from megloc_kapture.values import LocalizationResult, Pose, RigidTransform
 
 _log = logging.getLogger(__name__)

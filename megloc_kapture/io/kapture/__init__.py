@@ -17,7 +17,7 @@ from megloc_kapture.io.kapture.points import (
     write_point_covariances,
     write_points3d,
 )
-from megloc_kapture.io.kapture.sensors import KaptureData, Sensor, write_sensors
+from megloc_kapture.io.kapture.sensors import KaptureData, Sensor, is_kapture, write_sensors
 
 __all__ = [
     "FeatureConfig",
@@ -30,6 +30,7 @@ __all__ = [
     "MatchesWriter",
     "Observations",
     "Sensor",
+    "is_kapture",
     "read_pairs",
     "read_point_covariances",
     "write_observations",

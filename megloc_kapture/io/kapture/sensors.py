@@ -156,6 +156,10 @@ def _shortest(value: float) -> str:
 # ------------------------------------------------------------------------------------ reading
 
 
+def is_kapture(folder: Path) -> bool:
+    return (folder / "sensors" / "sensors.txt").is_file()
+
+
 def read_kapture_data(root: Path) -> KaptureData:
     """Read and check ``sensors/`` of a kapture; only sensors.txt must exist."""
     folder = root / "sensors"
