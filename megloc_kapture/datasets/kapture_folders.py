@@ -115,7 +115,7 @@ def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") 
     write_sensors(output / MAPPING, map_data)
     link_images(mapping.root, output / MAPPING)
     # written without poses, which the stages must not see
-    write_sensors(output / QUERY, _renamed(query_data, rename, is_truth=False))
+    write_sensors(output / QUERY, replace(_renamed(query_data, rename), trajectories={}))
     link_images(query.root, output / QUERY, below=query_prefix)
     truth = 0
     if is_kapture(root / QUERY_GT):
@@ -126,8 +126,8 @@ def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") 
         if strange:
             tell_of_truth_without_query(root / QUERY_GT, strange)
         records = {key: name for key, name in truth_data.records_camera.items() if name in queries}
-        of_queries = replace(truth_data, records_camera=records)
-        write_sensors(output / QUERY_GT, _renamed(of_queries, rename, is_truth=True))
+        of_queries = replace(truth_data, records_camera=records, records_depth={})
+        write_sensors(output / QUERY_GT, _renamed(of_queries, rename))
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)
     elif query_data.trajectories:
@@ -275,13 +275,11 @@ def prefixed(prefix: str) -> Callable[[str], str]:
     return lambda name: f"{folder}/{name}"
 
 
-def _renamed(data: KaptureData, rename: Callable[[str], str], *, is_truth: bool) -> KaptureData:
-    depth = {} if is_truth else data.records_depth
+def _renamed(data: KaptureData, rename: Callable[[str], str]) -> KaptureData:
     return replace(
         data,
-        trajectories=data.trajectories if is_truth else {},
         records_camera={key: rename(name) for key, name in data.records_camera.items()},
-        records_depth={key: rename(name) for key, name in depth.items()},
+        records_depth={key: rename(name) for key, name in data.records_depth.items()},
     )
 
 

@@ -287,7 +287,7 @@ def _summary(
             counts.append(Count(f"{recording.name}: {part} images", images.count(recording.name)))
             if recording.name in poses:
                 keyframes = poses[recording.name]
-                rows = len(keyframes.scene_from_cam) + len(keyframes.dropped)
+                rows = len(keyframes.scene_from_cam) + keyframes.num_dropped
                 counts.append(Count("  keyframes with a pose", len(keyframes.scene_from_cam), rows))
     for file in chosen.files:
         published = PUBLISHED_PAIRS.get((file.source, file.target))
@@ -307,9 +307,9 @@ def _remarks(
 ) -> list[str]:
     remarks = []
     for name, keyframes in poses.items():
-        if keyframes.dropped:
+        if keyframes.num_dropped:
             remarks.append(
-                f"{name}: {len(keyframes.dropped)} keyframes are left out: their fusion quality "
+                f"{name}: {keyframes.num_dropped} keyframes are left out: their fusion quality "
                 f"is below {min_fusion_quality} (min_fusion_quality)."
             )
     if frame.earth_from_scene is None:
@@ -385,12 +385,12 @@ class KeyframePoses:
     """The poses of one recording's keyframes, by timestamp (ns).
 
     ``scene_from_cam`` is the pose of the undistorted left camera, in metres. ``earth_from_scene``
-    transforms to ECEF. ``dropped`` keyframes have a fusion quality that is too low.
+    transforms to ECEF. The fusion quality of ``num_dropped`` keyframes is too low.
     """
 
     scene_from_cam: Mapping[int, RigidTransform]
     earth_from_scene: RigidTransform | None
-    dropped: Sequence[int] = ()
+    num_dropped: int = 0
 
 
 @dataclass(frozen=True)
@@ -450,10 +450,9 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         recording.folder / TRANSFORMATIONS
     )
     poses: dict[int, RigidTransform] = {}
-    dropped = []
-    for timestamp, (slam_from_cam, scale, quality) in sorted(read_gnss_poses(path).items()):
+    rows = read_gnss_poses(path)
+    for timestamp, (slam_from_cam, scale, quality) in sorted(rows.items()):
         if quality is not None and quality < min_fusion_quality:
-            dropped.append(timestamp)
             continue
         scale = common_scale if scale is None else scale
         if scale is None:
@@ -463,8 +462,8 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         poses[timestamp] = scene_from_slam @ metric
     require(
         poses,
-        f"none of its {len(dropped)} poses has a fusion quality of {min_fusion_quality} or "
+        f"none of its {len(rows)} poses has a fusion quality of {min_fusion_quality} or "
         "better; a lower min_fusion_quality accepts them",
         path=path,
     )
-    return KeyframePoses(poses, earth_from_scene, dropped)
+    return KeyframePoses(poses, earth_from_scene, len(rows) - len(poses))
