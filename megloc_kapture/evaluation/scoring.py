@@ -8,7 +8,7 @@ distance between the two cameras, so the error of the centre is reported too.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
@@ -365,18 +365,16 @@ def evaluate_pairs(
             groups={n: ImageGroup(condition=condition_of[p.file]) for n, p in named.items()},
         ),
     )
-    names, has_pose = by_center.errors.names, by_center.errors.has_pose
-    posed = [name for name, has in zip(names, has_pose, strict=True) if has]
-    world_from_reference = invert(*stack_poses(references[named[name].reference] for name in posed))
-    _, translations = compose(
-        *stack_poses(estimated[named[name]] for name in posed), *world_from_reference
-    )
-    _, true_translations = compose(
-        *stack_poses(truth[named[name].query] for name in posed), *world_from_reference
-    )
-    position_m = np.full(len(names), np.inf)
-    position_m[has_pose] = np.linalg.norm(translations - true_translations, axis=1)
-    errors = PoseErrors(names, position_m, by_center.errors.angle_deg)
+    errors = by_center.errors
+    posed = [named[name] for name, has in zip(errors.names, errors.has_pose, strict=True) if has]
+    world_from_reference = invert(*stack_poses(references[pair.reference] for pair in posed))
+
+    def translations(poses: Iterable[RigidTransform]) -> NDArray[np.float64]:
+        """Return those of ``query_from_reference`` (N, 3)."""
+        return compose(*stack_poses(poses), *world_from_reference)[1]
+
+    shifts = translations(estimated[p] for p in posed) - translations(truth[p.query] for p in posed)
+    errors.position_m[errors.has_pose] = np.linalg.norm(shifts, axis=1)
     queries = tuple(
         replace(
             query,
@@ -384,14 +382,14 @@ def evaluate_pairs(
             image=named[query.name].query,
             candidates=query.candidates or (named[query.name].reference,),
         )
-        for query, error_m in zip(by_center.queries, position_m.tolist(), strict=True)
+        for query, error_m in zip(by_center.queries, errors.position_m.tolist(), strict=True)
     )
     return replace(
         by_center,
         queries=queries,
         rows=recall_rows(queries, errors, by_center.thresholds, by_center.members),
         without_truth=tuple(sorted(n for n, p in named.items() if p.query not in truth)),
-        pairs={name: named[name] for name in names},
+        pairs={name: named[name] for name in errors.names},
         by_center=by_center,
     )
 

@@ -18,7 +18,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.errors import DataError, OptionError, OutputError, require
 from megloc_kapture.evaluation.evaluate import (
     Localized,
     benchmark_near,
@@ -91,10 +91,7 @@ def write_view(
         title = evaluation.label or title
     elif truth is not None:
         raise OptionError("true poses need a result to compare with")
-    view = view_data(context, queries)
-    if view is None:
-        raise DataError("no image has a pose, so there is nothing to show", path=folder.root)
-    data, notes = view
+    data, notes = view_data(context, queries)
     write_bytes(path, render_view(title, data, queries, notes).encode("utf-8"))
     return " ".join(notes)
 
@@ -123,12 +120,13 @@ def _check_output(path: Path, *, force: bool) -> None:
 
 def view_data(
     context: ResultContext, queries: Sequence[QueryResult] = ()
-) -> tuple[dict[str, Any], list[str]] | None:
+) -> tuple[dict[str, Any], list[str]]:
     """Return the data of the page's script, and sentences about what they omit.
 
-    None if no camera has a pose. ``queries`` are ranked, worst first. Coordinates are float32,
-    relative to ``origin``. A frustum (5, 3) has the camera's centre, then rays at depth 1 through
-    the upper left, upper right, lower right and lower left corner of the image; NaN without a pose.
+    Raise DataError if no camera has a pose. ``queries`` are ranked, worst first. Coordinates are
+    float32, relative to ``origin``. A frustum (5, 3) has the camera's centre, then rays at depth 1
+    through the upper left, upper right, lower right and lower left corner of the image; NaN without
+    a pose.
     ``inliers`` (K, 3) are those of all queries, one after the other; ``drawn`` counts them per
     query. Frames of points, cameras and queries are indices into ``frames``, of which one is shown
     at a time. ``radius`` is that of the content initially in view.
@@ -158,8 +156,8 @@ def view_data(
     poses = [map_poses[name] for name in names]
     true = [query.truth for query in queries if query.truth is not None]
     spanning = poses + true or [q.cam_from_world for q in queries if q.cam_from_world is not None]
-    if not spanning:
-        return None
+    root = None if mapping is None else mapping.root
+    require(spanning, "no image has a pose, so there is nothing to show", path=root)
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
     axes, _ = top_view(quats, centers)

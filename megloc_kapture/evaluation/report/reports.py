@@ -299,11 +299,8 @@ def _sections_of(
     from megloc_kapture.evaluation.report import figures, gallery
 
     whose = f"{evaluation.label}: " if several else ""
-    context, queries, has_truth = (
-        evaluation.context,
-        shown_queries(evaluation),
-        evaluation.has_truth,
-    )
+    context, has_truth = evaluation.context, evaluation.has_truth
+    queries = shown_queries(evaluation)
     above: list[Markup | None] = []
     views = figures.views_from_above(queries, map_poses, context.frames, context.unit)
     for frame, svg in views.items():
@@ -357,9 +354,8 @@ def _view(reported: Reported) -> str | None:
     # a report without a view is better than none; `megloc view` reports the error
     with contextlib.suppress(DataError):
         queries = shown_queries(evaluation)
-        if (view := view_data(evaluation.context, queries)) is not None:
-            data, notes = view
-            return render_view(evaluation.label or "Evaluation", data, queries, notes)
+        data, notes = view_data(evaluation.context, queries)
+        return render_view(evaluation.label or "Evaluation", data, queries, notes)
     return None
 
 

@@ -16,6 +16,7 @@ import pycolmap
 import pytest
 from scored import evaluate_poses, upright_camera, write_kapture
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation import view as scenes
 from megloc_kapture.evaluation.report.queries import legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
@@ -87,9 +88,7 @@ View = tuple[dict[str, Any], list[str]]
 
 def drawn(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> View:
     mapping = KaptureFolder(root)
-    view = view_data(ResultContext(mapping=mapping, **context), queries)
-    assert view is not None
-    return view
+    return view_data(ResultContext(mapping=mapping, **context), queries)
 
 
 def page_of(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> str:
@@ -211,7 +210,8 @@ def test_coordinate_frames_are_separate(world: Any, make_map: Any) -> None:
     assert data["queryFrames"].tolist() == [k % 2 for k in range(len(shown))]
     assert "DUC2</option>" in page_of(root, shown, frames=floors)
     assert 'id="frame"' not in page_of(root, shown)
-    assert view_data(ResultContext()) is None
+    with pytest.raises(DataError, match="no image has a pose"):
+        view_data(ResultContext())
 
 
 def test_points_without_colours_get_image_colours(make_map: Any) -> None:
