@@ -354,8 +354,8 @@ def write_provenance(
     *,
     counts: Mapping[str, int],
     files: Sequence[str] | None = None,
-) -> Path:
-    """Write the provenance of a pose file, or of ``files`` in a folder; return the JSON's path.
+) -> None:
+    """Write the provenance of a pose file, or of ``files`` in a folder.
 
     The JSON has the SHA-256 of each file, package versions, ``counts`` and the entries of
     ``provenance`` (options, preset, inputs), but no date: the same run gives the same bytes.
@@ -367,9 +367,7 @@ def write_provenance(
         "versions": package_versions(),
         "counts": dict(counts),
     }
-    path = provenance_path(target)
-    write_json(path, ours | dict(provenance))
-    return path
+    write_json(provenance_path(target), ours | dict(provenance))
 
 
 def _sha256(path: Path) -> str:

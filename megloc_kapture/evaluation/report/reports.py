@@ -52,27 +52,28 @@ def write_report(
     reported: Reported,
     *,
     provenance: Mapping[str, Any] | None = None,
-) -> dict[str, Path]:
-    """Write the files of a report and return name -> path.
+) -> None:
+    """Write the files of a report.
 
-    The files are recall.json and recall.txt (without truth agreement.json and agreement.txt),
+    They are recall.json and recall.txt (without truth agreement.json and agreement.txt),
     per_query.csv, report.html, and view.html for a single result. ``provenance`` is JSON data,
     shown at the end of the page; its ``steps``, a table of the stages, are near the top.
     """
     name = "agreement" if isinstance(reported, WithoutTruth) else "recall"
     view = _view(reported)
     page = render_report(reported, provenance=provenance, has_view=view is not None)
-    texts = {f"{name}.txt": report_text(reported), REPORT_HTML: page}
-    if view is not None:
-        texts[VIEW_HTML] = view
     # pandas writes floats that read back exactly; infinite ones become empty cells
     table = reported.to_pandas().replace([np.inf, -np.inf], np.nan)
-    texts[PER_QUERY_CSV] = table.to_csv(lineterminator="\n")
-    paths = {file: Path(folder) / file for file in (*texts, f"{name}.json")}
+    texts = {
+        f"{name}.txt": report_text(reported),
+        REPORT_HTML: page,
+        PER_QUERY_CSV: table.to_csv(lineterminator="\n"),
+    }
+    if view is not None:
+        texts[VIEW_HTML] = view
     for file, text in texts.items():
-        write_bytes(paths[file], text.encode("utf-8"))
-    write_json(paths[f"{name}.json"], plain(report_data(reported)))
-    return paths
+        write_bytes(Path(folder) / file, text.encode("utf-8"))
+    write_json(Path(folder) / f"{name}.json", plain(report_data(reported)))
 
 
 def report_text(reported: Reported) -> str:

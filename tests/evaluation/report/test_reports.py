@@ -75,12 +75,14 @@ def test_names_are_escaped_and_the_steps_of_the_paper_come_first(world: Any) -> 
 def test_files(world: Any, tmp_path: Path) -> None:
     evaluation = evaluation_of(world)
     provenance = {"preset": "classic"}
-    paths = write_report(tmp_path / "evaluation", evaluation, provenance=provenance)
+    write_report(tmp_path / "evaluation", evaluation, provenance=provenance)
+    paths = {path.name: path for path in (tmp_path / "evaluation").iterdir()}
 
     assert "Recall" in visible_text(paths["report.html"].read_text())
     with pytest.raises(OutputError, match="recall"):
         write_report(paths["recall.txt"], evaluation)
-    assert sorted(path.name for path in (tmp_path / "evaluation").iterdir()) == sorted(paths)
+    names = ["per_query.csv", "recall.json", "recall.txt", "report.html", "view.html"]
+    assert sorted(paths) == names
     assert paths["recall.txt"].read_text() == report_text(evaluation)
     summary = json.loads(paths["recall.json"].read_text())
     assert summary["label"] == evaluation.label
