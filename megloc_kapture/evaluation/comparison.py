@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, compress
 from typing import Any
 
@@ -89,36 +89,38 @@ class Comparison(Reported):
 def compare(evaluations: Sequence[Evaluation]) -> Comparison:
     """Compare at least two results on the same queries, thresholds and conditions."""
     _check_comparable(evaluations)
-    names = np.array(evaluations[0].errors.names, dtype=object)
-    tables, medians = [], []
+    tests, medians = list[PairedTest](), []
     resampled = {e.label: _resampled_medians(e.errors.position_m) for e in evaluations}
     for first, second in combinations(evaluations, 2):
         pair = first.label, second.label
-        for threshold in first.thresholds:
-            a, b = within(first.errors, threshold), within(second.errors, threshold)
-            tables.append((pair, threshold, a, b))
+        tests += [_paired_test(first, second, threshold) for threshold in first.thresholds]
         medians_m = first.row().median_position_m, second.row().median_position_m
         interval_m = float("nan"), float("nan")
-        if len(names) >= MIN_RESAMPLED:
+        if len(first.queries) >= MIN_RESAMPLED:
             interval_m = difference_interval(*(resampled[label] for label in pair))
         medians.append(MedianDifference(*pair, *medians_m, *interval_m))
-    p_values = [mcnemar(int((a & ~b).sum()), int((b & ~a).sum())) for *_, a, b in tables]
-    tests = tuple(
-        PairedTest(
-            *pair,
-            threshold=threshold,
-            only_first=tuple(names[a & ~b].tolist()),
-            only_second=tuple(names[b & ~a].tolist()),
-            both=int((a & b).sum()),
-            neither=int((~a & ~b).sum()),
-            p_value=p_value,
-            p_adjusted=adjusted,
-        )
-        for (pair, threshold, a, b), p_value, adjusted in zip(
-            tables, p_values, holm(p_values).tolist(), strict=True
-        )
+    adjusted = holm([test.p_value for test in tests]).tolist()
+    corrected = (replace(t, p_adjusted=p) for t, p in zip(tests, adjusted, strict=True))
+    return Comparison(tuple(evaluations), tuple(corrected), tuple(medians))
+
+
+def _paired_test(first: Evaluation, second: Evaluation, threshold: Threshold) -> PairedTest:
+    """Return the test at a threshold, without the correction for the number of tests."""
+    a, b = within(first.errors, threshold), within(second.errors, threshold)
+    names = np.array(first.errors.names, dtype=object)
+    only_first, only_second = names[a & ~b].tolist(), names[b & ~a].tolist()
+    p_value = mcnemar(len(only_first), len(only_second))
+    return PairedTest(
+        first=first.label,
+        second=second.label,
+        threshold=threshold,
+        both=int((a & b).sum()),
+        neither=int((~a & ~b).sum()),
+        only_first=tuple(only_first),
+        only_second=tuple(only_second),
+        p_value=p_value,
+        p_adjusted=p_value,
     )
-    return Comparison(tuple(evaluations), tests, tuple(medians))
 
 
 def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
