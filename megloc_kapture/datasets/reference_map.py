@@ -28,6 +28,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
+from megloc_kapture.mapping.uncertainty import rows_by_id
 
 # feature type of COLMAP's feature/types.h -> name of the extractor or weights in this package, and
 # dtype; COLMAP stores all descriptors as bytes, but those of networks are float32
@@ -181,9 +182,8 @@ def write_reference_map(
     config = FeatureConfig(keypoints_type.upper(), np.dtype(np.float32), 2)
     writer = FeatureWriter(output, "keypoints", keypoints_type, config)
     positions = {name: position for position, name in enumerate(image_names)}
-    order = np.argsort(points.image_ids, kind="stable")
-    ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
-    keypoint_ids = np.full(len(order), -1, np.int32)  # -1: omitted observation
+    rows_of = rows_by_id(points.image_ids, len(image_names))
+    keypoint_ids = np.full(len(points.image_ids), -1, np.int32)  # -1: omitted observation
     new_ids = np.zeros(len(image_names), np.int32)
     # number of keypoints, and name in the database, by image
     lengths, sources = dict[str, int](), dict[str, str]()
@@ -204,7 +204,7 @@ def write_reference_map(
         for new_id, name in enumerate(names):
             position = positions[name]
             new_ids[position] = new_id
-            rows = order[ends[position] : ends[position + 1]]
+            rows = rows_of[position]
             features, xy_px = points.feature_ids[rows].astype(np.int64), points.xy_px[rows]
             keypoints, numbers = _keypoints_of(source, name, sources.get(name), features, xy_px)
             if scales and name in scales:

@@ -311,7 +311,7 @@ def confidence_of(
     right = coarsest.holds([q.position_m for q in posed], [q.angle_deg for q in posed])
     values = np.array([q.confidence for q in posed], dtype=np.float64)
     num_queries, num_wrong = len(queries) + len(nowhere), int((~right).sum())
-    lows, highs = confidence_interval(np.array([num_wrong]), max(len(posed), 1))
+    low, high = confidence_interval(num_wrong, max(len(posed), 1))
     risk = risk_by_score(values, right)
     inliers = [q.num_inliers for q in posed]
     by_inliers = None
@@ -322,8 +322,8 @@ def confidence_of(
         num_queries=num_queries,
         num_poses=len(posed),
         num_wrong=num_wrong,
-        wrong_low=float(lows[0]),
-        wrong_high=float(highs[0]),
+        wrong_low=float(low),
+        wrong_high=float(high),
         num_nowhere=len(nowhere),
         num_nowhere_refused=len(nowhere) - len(strays),
         bins=bins,

@@ -44,6 +44,7 @@ from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.mapping.uncertainty import rows_by_id
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
@@ -321,10 +322,9 @@ def _color_from_images(
 ) -> None:
     for name, seen in mapping.observations().items():
         keypoints = mapping.keypoints(name)
-        order = np.argsort(seen.image_ids, kind="stable")
-        ends = np.searchsorted(seen.image_ids[order], np.arange(len(seen.image_names) + 1))
+        rows_of = rows_by_id(seen.image_ids, len(seen.image_names))
         for at in spread(len(seen.image_names), _MAX_COLOR_IMAGES).tolist():
-            rows = order[ends[at] : ends[at + 1]]
+            rows = rows_of[at]
             rows = rows[seen.point_ids[rows] < len(position)]
             drawn = position[seen.point_ids[rows]]
             rows, drawn = rows[drawn >= 0], drawn[drawn >= 0]

@@ -241,11 +241,9 @@ def _known_poses(
     """Return the queries with their published poses, else with those in ``ground_truth/``."""
     times = {timestamp for timestamp, _ in query.records_camera}
     poses = {key: pose for key, pose in published.items() if key[0] in times}
-    known = with_poses(query, poses)
     if truth_folder is not None:
-        for (timestamp, device), pose in truth_folder.trajectories.items():
-            if known.device_from_world(timestamp, device) is None:
-                poses[timestamp, device] = pose
+        known, others = with_poses(query, poses), truth_folder.trajectories
+        poses |= {k: pose for k, pose in others.items() if known.device_from_world(*k) is None}
     return with_poses(query, poses) if poses else None
 
 
