@@ -19,7 +19,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import metadata
-from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, TypeVar
 
@@ -177,24 +176,28 @@ def poses_by_image(
     by_stem: dict[str, set[str]] = {}
     for name, image in (*listed.items(), *((end, i) for end, all_ in by_end.items() for i in all_)):
         by_stem.setdefault(_stem(name), set()).add(image)
+
+    def images_called(name: str) -> list[str]:
+        if name in listed:
+            return [listed[name]]
+        if name in known:
+            return [name]
+        if name in by_end:
+            return by_end[name]
+        longer = [end for end in _ends(name)[1:] if end in known and end not in poses]
+        alike = longer[:1] or [*by_stem.get(_stem(name), ())]
+        return alike if len(alike) == 1 else [name]
+
     named: dict[str, str] = {}
     for name in poses:
-        fitting = [name] if name in known else by_end.get(name, [])
-        if name in listed:
-            fitting = [listed[name]]
-        if not fitting:
-            longer = (end for end in _ends(name)[1:] if end in known and end not in poses)
-            fitting = list(islice(longer, 1))
-        if not fitting:
-            alike = by_stem.get(_stem(name), {name})
-            fitting = list(alike) if len(alike) == 1 else [name]
-        if len(fitting) > 1:
-            raise DataError(f"{name!r} may be {fitting[0]!r} or {fitting[1]!r}; use full names")
-        if other := named.get(fitting[0]):
+        image, *others = images_called(name)
+        if others:
+            raise DataError(f"{name!r} may be {image!r} or {others[0]!r}; use full names")
+        if other := named.get(image):
             raise DataError(
-                f"image {fitting[0]!r} is named in two ways: {other!r}, {name!r}; use full names"
+                f"image {image!r} is named in two ways: {other!r}, {name!r}; use full names"
             )
-        named[fitting[0]] = name
+        named[image] = name
     return {image: poses[name] for image, name in named.items()}
 
 

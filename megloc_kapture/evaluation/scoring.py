@@ -300,18 +300,15 @@ def query_result(
 ) -> QueryResult:
     """Return the result of a query, given its errors in metres and degrees."""
     pose = result.poses.get(image)
-    status = result.statuses.get(image)
-    if status is None:
-        outcome: Outcome = "missing" if pose is None else "localized"
-        reason = NO_POSE if pose is None else ""
-        status = LocalizationResult()
-    elif pose is not None and status.fallback == "none":
-        outcome, reason = "localized", ""
-    elif pose is not None:
-        outcome, reason = "fallback", status.reason
-    else:
+    unknown = LocalizationResult(reason=NO_POSE if pose is None else "")
+    status = result.statuses.get(image, unknown)
+    outcome: Outcome = "fallback"
+    reason = status.reason
+    if pose is None:
         outcome = "missing"
-        reason = status.reason or "the status is localized, but the result has no pose"
+        reason = reason or "the status is localized, but the result has no pose"
+    elif status.fallback == "none":
+        outcome, reason = "localized", ""
     known = {each.name: getattr(status, each.name) for each in fields(LocalizationResult)}
     known |= {"cam_from_world": pose, "reason": reason, "name": image}
     if pose is None:
