@@ -118,7 +118,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         frames={image: g.frame for image, g in side_tables.groups.items() if g.frame},
         refinements=_if_there(_read_refinement, folder / tables.REFINEMENT_FILE) or {},
         consistency=read_records(folder / tables.CONSISTENCY_FILE, ConsistencyRow, missing_ok=True),
-        unit=unit_of(result),
+        unit=unit_of(workspace or folder),
     )
 
 

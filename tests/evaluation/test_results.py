@@ -158,11 +158,12 @@ def test_context_of_a_result(tmp_path: Path) -> None:
     assert alone.query_images() == ["q.jpg"] and alone.map_poses() == {}
     assert context_of(result, mapping=workspace / "mapping").map_poses() == here
     groups = {"m.jpg": ImageGroup(frame="DUC1"), "q.jpg": ImageGroup()}
-    write_side_tables(workspace / "megloc", SideTables(groups=groups))
+    tables = SideTables(groups=groups, world=World(unit="units"))
+    write_side_tables(workspace / "megloc", tables)
     assert side_tables_near(workspace / "submissions/poses.txt") == workspace / "megloc"
     around = context_of(workspace / "submissions/poses.txt")
     assert around.query_images() == ["q.jpg", "r.jpg"] and around.map_poses() == here
-    assert around.frames == {"m.jpg": "DUC1"}
+    assert around.frames == {"m.jpg": "DUC1"} and around.unit == "units"
     nothing = context_of(tmp_path / "elsewhere/poses.txt")
     assert nothing.query_images() == [] and nothing.queries is None
 
