@@ -28,7 +28,7 @@ from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     Protocol,
     check_tables,
-    read_side_tables,
+    read_protocol,
     tables_of,
 )
 from megloc_kapture.io.kapture import is_kapture
@@ -39,10 +39,7 @@ from megloc_kapture.pipeline.datasets import (
     check_known,
     dataset_names,
 )
-from megloc_kapture.pipeline.submission import (
-    workspace_provenance,
-    write_submission,
-)
+from megloc_kapture.pipeline.submission import workspace_provenance, write_submission
 from megloc_kapture.stages.paths import EVALUATION, MAPPING
 
 
@@ -122,7 +119,7 @@ class Submit(Common):
         if self.side_tables is not None:
             check_tables(self.side_tables)
         tables = self.side_tables or tables_of(self.input)
-        rules = Protocol() if tables is None else read_side_tables(tables).protocol
+        rules = Protocol() if tables is None else read_protocol(tables)
         check_dataset(self.dataset, rules, tables=tables)
         if rules.pose_file == "mlad":
             check_claim(self.output, kind="submission", force=self.force)

@@ -25,6 +25,7 @@ from megloc_kapture.io.dataset_tables import (
     SideTables,
     World,
     read_side_tables,
+    read_world,
     unit_of,
 )
 from megloc_kapture.io.files import named
@@ -281,7 +282,7 @@ def distinct_labels(sources: Sequence[Path]) -> list[str]:
 def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -> Poses:
     """Transform poses of a workspace with another local frame to the truth's frame."""
     side_tables = side_tables_near(result)
-    result_world = world if side_tables is None else read_side_tables(side_tables).world
+    result_world = world if side_tables is None else read_world(side_tables)
     if result_world.official_from_local == world.official_from_local:
         return poses
     return {i: world.pose_in_local(result_world.pose_in_official(p)) for i, p in poses.items()}

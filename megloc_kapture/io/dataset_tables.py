@@ -278,12 +278,12 @@ def read_side_tables(folder: Path | str) -> SideTables:
     groups = dict(read_records(folder / GROUPS_FILE, _group, missing_ok=True))
     pairs = folder / RELOCALIZATION_FILE
     return SideTables(
-        protocol=_read_model(folder / PROTOCOL_FILE, Protocol),
+        protocol=read_protocol(folder),
         groups=dict(sorted(groups.items())),
         priors=permitted,
         names=dict(read_records(folder / NAMES_FILE, _name, missing_ok=True)),
         relocalization=read_records(pairs, RelocalizationPair, missing_ok=True),
-        world=_read_model(folder / WORLD_FILE, World),
+        world=read_world(folder),
     )
 
 
@@ -341,11 +341,22 @@ def write_unit(root: Path, unit: str) -> None:
 
 def unit_of(root: Path | str) -> str:
     """Return the unit of a map, or of results localized in a map: m or :data:`NO_METRES`."""
-    return read_tables_of(root).world.unit
+    tables = tables_of(root)
+    return METRES if tables is None else read_world(tables).unit
+
+
+def read_world(folder: Path | str) -> World:
+    """Read the world alone, since the tables of a large dataset take a second."""
+    return _read_model(Path(folder) / WORLD_FILE, World)
 
 
 def write_world(folder: Path | str, world: World) -> None:
     write_json_model(Path(folder) / WORLD_FILE, world)
+
+
+def read_protocol(folder: Path | str) -> Protocol:
+    """Read the protocol alone; see :func:`read_world`."""
+    return _read_model(Path(folder) / PROTOCOL_FILE, Protocol)
 
 
 def write_protocol(folder: Path | str, protocol: Protocol) -> None:

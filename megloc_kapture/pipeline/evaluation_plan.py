@@ -15,7 +15,7 @@ from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.report.reports import RECALL_JSON, write_report
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_side_tables, write_protocol
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_protocol, write_protocol
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     TWIN_PREFIX,
@@ -96,7 +96,7 @@ class Run:
         The name begins as the server requires, as in ``Aachen_v1_1_eval_METHOD.txt``; for twins and
         datasets without a server, with the dataset's name.
         """
-        protocol = read_side_tables(tables).protocol
+        protocol = read_protocol(tables)
         stem = self.dataset
         if protocol.pose_file_stem and not stem.startswith(TWIN_PREFIX):
             stem = protocol.pose_file_stem
@@ -298,7 +298,7 @@ class Import(_RunStage):
         counts = source.import_to(root, work.out)
         require(counts["queries"], "no query image is left to localize", path=root)
         unreadable = set_aside_unreadable(work.out / paths.QUERY, work.out / SIDE_TABLES, work)
-        protocol = read_side_tables(work.out / SIDE_TABLES).protocol
+        protocol = read_protocol(work.out / SIDE_TABLES)
         if protocol.dataset == Protocol().dataset:
             protocol = protocol.model_copy(update={"dataset": self._run.dataset})
         write_protocol(work.out / SIDE_TABLES, self._run.benchmark.change(protocol))

@@ -33,8 +33,8 @@ from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     UNREGISTERED_FILE,
     Protocol,
-    read_side_tables,
     read_unreadable,
+    read_world,
     write_protocol,
     write_unit,
     write_unreadable,
@@ -249,7 +249,7 @@ def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
         lines.append(f"not in the map: {shown}: {reason}")
     if missing:
         lines.append(f"full list: {tables / UNREGISTERED_FILE}")
-    world = read_side_tables(tables).world
+    world = read_world(tables)
     if world.unit == NO_METRES:
         hint = "--scale gps sets the scale" if len(photographs.gps()) >= MIN_IMAGES else ""
         hint = hint or "--scale IMAGE IMAGE METRES sets the scale"
