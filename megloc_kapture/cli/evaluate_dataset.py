@@ -10,7 +10,7 @@ import tyro
 
 from megloc_kapture.cli.common import Localizing, Overwrite, Texts, Working
 from megloc_kapture.errors import OptionError, check_option
-from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.metrics import Threshold, pairs_of_thresholds
 from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_TEXT, REPORT_HTML
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
@@ -90,8 +90,8 @@ class Eval(Localizing, Working):
             return 0
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
-            pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
-            benchmark = run.benchmark.model_copy(update={"thresholds": pairs})
+            update = {"thresholds": pairs_of_thresholds(parsed)}
+            benchmark = run.benchmark.model_copy(update=update)
             run = replace(run, benchmark=benchmark)
         self._check_fail_below(run.source)
         root = self.workspace or run.default_workspace

@@ -13,7 +13,7 @@ import numpy as np
 
 from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.evaluation.comparison import WithoutTruth, evaluate_without_truth
-from megloc_kapture.evaluation.metrics import Threshold, pose_errors
+from megloc_kapture.evaluation.metrics import Threshold, pairs_of_thresholds, pose_errors
 from megloc_kapture.evaluation.pose_files import poses_by_image
 from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.results import (
@@ -135,8 +135,8 @@ def benchmark_near(
     benchmark = benchmark_of(side_tables, dataset)
     if not thresholds:
         return benchmark
-    pairs = tuple((threshold.position_m, threshold.angle_deg) for threshold in thresholds)
-    return replace(benchmark, protocol=benchmark.protocol.model_copy(update={"thresholds": pairs}))
+    update = {"thresholds": pairs_of_thresholds(thresholds)}
+    return replace(benchmark, protocol=benchmark.protocol.model_copy(update=update))
 
 
 def evaluate_results(

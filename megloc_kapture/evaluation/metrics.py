@@ -67,6 +67,11 @@ def thresholds_from_pairs(pairs: Iterable[tuple[float, float | None]]) -> tuple[
     return tuple(Threshold(position_m=p, angle_deg=a) for p, a in pairs)
 
 
+def pairs_of_thresholds(thresholds: Iterable[Threshold]) -> tuple[tuple[float, float | None], ...]:
+    """Return position (m) and angle (deg) of each threshold, as a protocol has them."""
+    return tuple((threshold.position_m, threshold.angle_deg) for threshold in thresholds)
+
+
 def from_fine_to_coarse(thresholds: Iterable[Threshold]) -> list[Threshold]:
     return sorted(
         thresholds, key=lambda t: (t.position_m, np.inf if t.angle_deg is None else t.angle_deg)
