@@ -371,7 +371,9 @@ def evaluate_pairs(
         return compose(*stack_poses(poses), *world_from_reference)[1]
 
     shifts = translations(estimated[p] for p in posed) - translations(truth[p.query] for p in posed)
-    errors.position_m[errors.has_pose] = np.linalg.norm(shifts, axis=1)
+    position_m = np.full(len(errors.names), np.inf)
+    position_m[errors.has_pose] = np.linalg.norm(shifts, axis=1)
+    errors = replace(errors, position_m=position_m)
     queries = tuple(
         replace(
             query,
@@ -379,7 +381,7 @@ def evaluate_pairs(
             image=named[query.name].query,
             candidates=query.candidates or (named[query.name].reference,),
         )
-        for query, error_m in zip(by_center.queries, errors.position_m.tolist(), strict=True)
+        for query, error_m in zip(by_center.queries, position_m.tolist(), strict=True)
     )
     return replace(
         by_center,
