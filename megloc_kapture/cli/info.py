@@ -43,7 +43,7 @@ from megloc_kapture.values import Options
 _COLUMN = 18
 _QUANTILES = (0.1, 0.5, 0.9)
 # twins have the names of their datasets
-_GROUPS = PROTOCOLS.keys() - {RENDERED_DATASETS}
+_GROUPS = [group for group in PROTOCOLS if group != RENDERED_DATASETS]
 
 
 @dataclass(frozen=True, kw_only=True)
