@@ -22,6 +22,7 @@ from megloc_kapture.io.files import (
     write_bytes,
     writing,
 )
+from megloc_kapture.io.kapture import is_kapture
 
 MARKER = ".megloc"
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
@@ -100,7 +101,7 @@ def staged_output(
             f"{folder}: is or contains an input, which the output could overwrite; "
             "give another folder"
         )
-    is_foreign = (folder / "sensors" / "sensors.txt").is_file() and _read_mark(folder)[:1] != [kind]
+    is_foreign = is_kapture(folder) and _read_mark(folder)[:1] != [kind]
     if is_foreign and not adds:
         raise OutputError(
             f"{folder}: holds other kapture data, which is never overwritten; give an empty folder"
