@@ -28,7 +28,7 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.mapping.uncertainty import rows_by_id
+from megloc_kapture.io.kapture.points import rows_by_id
 
 # feature type of COLMAP's feature/types.h -> name of the extractor or weights in this package, and
 # dtype; COLMAP stores all descriptors as bytes, but those of networks are float32

@@ -44,7 +44,7 @@ from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.mapping.uncertainty import rows_by_id
+from megloc_kapture.io.kapture.points import rows_by_id
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000

@@ -90,13 +90,6 @@ class UncertaintyOptions(Options):
     )
 
 
-def rows_by_id(ids: NDArray[np.integer], count: int) -> list[NDArray[np.int64]]:
-    """Return, for each id from 0 to ``count`` - 1, its rows in ``ids`` (O,), ascending."""
-    # numpy sorts 16-bit integers in linear time
-    order = np.argsort(ids.astype(np.uint16) if count < 1 << 16 else ids, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(ids, minlength=count))[:-1])
-
-
 def mean_depths(
     xyz: Floats,
     point_ids: NDArray[np.int64],

@@ -27,7 +27,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.features import ArrayKind
 from megloc_kapture.io.kapture.folder import ARRAY_KINDS
-from megloc_kapture.mapping.uncertainty import rows_by_id
+from megloc_kapture.io.kapture.points import rows_by_id
 
 # detector implementations differ by tenths of a pixel
 _MAX_SHIFT_PX = 1.0

@@ -27,7 +27,7 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import write_json
 from megloc_kapture.io.kapture import KaptureFolder, Observations
-from megloc_kapture.io.kapture.points import write_point_covariances
+from megloc_kapture.io.kapture.points import rows_by_id, write_point_covariances
 from megloc_kapture.mapping.depth import (
     KEYPOINT_NOISE_PX,
     DepthVerificationOptions,
@@ -39,7 +39,6 @@ from megloc_kapture.mapping.uncertainty import (
     mean_depths,
     point_covariances,
     point_deviations,
-    rows_by_id,
     too_uncertain,
 )
 from megloc_kapture.stages import paths
