@@ -177,10 +177,10 @@ class Map:
         ----------
         query : image file; uint8 (H, W, 3) RGB; a pillow image; a video; a list of image files; a
             kapture folder, or a folder of plain images.
-        camera : intrinsics of the pixels as stored, with COLMAP's models and pixel origin. Without
+        camera : intrinsics of the image as stored, with COLMAP's models and pixel origin. Without
             a camera, an image is rotated upright by its EXIF orientation, and its focal length is
             initialised from EXIF or a guess and estimated with the pose, see ``Pose.camera``.
-        prior : names of the map images to match with one image.
+        prior : names of the map images to match with the query, which must be a single image.
         refine : names of pose refiners, applied in order: icp, rendering, field.
         workers : threads, for several images.
         """
@@ -213,7 +213,7 @@ def _query_of(
     prior: Sequence[str] | None,
 ) -> Query:
     check_image(image)
-    name = image.name if isinstance(image, Path) else "query"  # as in a list or a folder
+    name = image.name if isinstance(image, Path) else "query"  # its name in a list or a folder
     if camera is not None:
         check_camera(camera)
         if isinstance(image, np.ndarray):
@@ -240,7 +240,7 @@ def open_map(
     features_dirs: Sequence[Path | str] | Path | str = (),
     pixel_origin: PixelOriginChoice = "auto",
 ) -> Map:
-    """Open a map from this package or another tool, with all keypoint types that have points.
+    """Open a map from this package or another tool, with all keypoint types that have 3D points.
 
     Parameters
     ----------
@@ -411,7 +411,7 @@ def extract(
     """Extract local features of an image with a named extractor.
 
     ``image`` is one image as in :meth:`Map.localize`, but never rotated; ``options`` are the
-    extractor's. PluginError or MissingWeightsError if the extractor cannot be loaded.
+    extractor's. Raises PluginError or MissingWeightsError if the extractor cannot be loaded.
     """
     check_image(image)
     name = "given"
@@ -429,7 +429,7 @@ def match(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Match two images with a named matcher; return keypoint rows, int64 (K, 2), and scores (K,).
 
-    PluginError or MissingWeightsError if the matcher cannot be loaded.
+    Raises PluginError or MissingWeightsError if the matcher cannot be loaded.
     """
     return match_all(load_plugin(MATCHERS, matcher, options), first, [second], ["the images"])[0]
 
@@ -459,7 +459,7 @@ def solve_pose(
         points = np.asarray(points_world, np.float64).reshape(len(pixels), 3)
     except (TypeError, ValueError) as error:
         raise DataError(
-            "2D-3D matches are points_px (N, 2) and points_world (N, 3), got "
+            "expected points_px (N, 2) and points_world (N, 3), got "
             f"{np.shape(points_px)} and {np.shape(points_world)}"
         ) from error
     return absolute_pose(pixels, points, camera, options)
@@ -479,7 +479,7 @@ def train(
 ) -> dict[str, float]:
     """Train SuperGlue or descriptors as ``megloc train`` does; an interrupted run is resumed.
 
-    Return the last row of the training curves by column.
+    Return the last values of the training curves, by name.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Errors, outcomes and recall of one result, by absolute poses or by the pairs of MLAD.
+"""Errors, outcomes and recall of one result, from absolute poses or from MLAD's image pairs.
 
 The MLAD challenges (4Seasons relocalization) score ``|t - t_true|`` of ``query_from_reference`` for
 pairs of images. That length mixes the error of the camera centre with the rotation error times the
@@ -60,7 +60,7 @@ class QueryResult(LocalizationResult):
 
     Attributes
     ----------
-    image : image of the query in the dataset; in an evaluation of pairs, ``name`` is the pair's.
+    image : the query's image in the dataset; an evaluation of pairs has their names in ``name``.
     outcome : ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
     position_m, angle_deg : errors; infinite without a pose and for a query that shows nothing of
         the map, NaN in a comparison without ground truth.
@@ -128,15 +128,15 @@ class Evaluation(Reported):
 
     Attributes
     ----------
-    rows : recall per condition, per pool, and of ``"all"``, which is the last.
+    rows : recall per condition, per pool of conditions and, last, for ``"all"``.
     members : row name -> mask (N,) of its queries.
     queries : N counted queries, sorted by name.
     without_truth : images or pairs without a true pose, sorted; reported but not counted.
     not_scored : images with a true pose that the benchmark does not score, sorted; likewise.
     truth_known_by : note on who has the true poses, if they are not published; else empty.
     pairs : name of a query -> its pair, for the MLAD challenges.
-    nowhere : queries that show nothing of the map; recall ignores them, and any pose of theirs is
-        wrong.
+    nowhere : queries that show nothing of the map; recall ignores them, and any pose
+        estimated for them is wrong.
     by_center : the same pairs of MLAD, evaluated by the error of the camera centre.
     covariance : counts of localized poses: ``num_poses`` have a covariance, ``num_within`` have the
         true pose in its 95 % region.
@@ -329,10 +329,10 @@ def evaluate_pairs(
 ) -> Evaluation:
     """Evaluate by MLAD's metric: every pair counts once.
 
-    If there are several files, each is a condition. A pair has the name of its query; a query in
-    several pairs is named "QUERY from REFERENCE, FILE". Poses are ``cam_from_world`` in one frame,
-    in metres. Position errors are those of the relative translation; ``by_center`` has those of the
-    camera centre.
+    If there are several files, each is a condition. A pair is named after its query, or
+    "QUERY from REFERENCE, FILE" if the query is in several pairs. Poses are ``cam_from_world`` in
+    one frame, in metres. Position errors are those of the relative translation; ``by_center`` has
+    those of the camera centre.
     """
     pairs, estimated = benchmark.relocalization, result.by_pair
     if estimated is None:
@@ -367,7 +367,7 @@ def evaluate_pairs(
     world_from_reference = invert(*stack_poses(references[pair.reference] for pair in posed))
 
     def translations(poses: Iterable[RigidTransform]) -> NDArray[np.float64]:
-        """Return those of ``query_from_reference`` (N, 3)."""
+        """Return the translations of ``query_from_reference``, (N, 3)."""
         return compose(*stack_poses(poses), *world_from_reference)[1]
 
     shifts = translations(estimated[p] for p in posed) - translations(truth[p.query] for p in posed)

@@ -114,7 +114,7 @@ def _describe(
 
 
 def gray_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-    """Convert an RGB image to 8-bit luma, float32 (1, 1, H, W) in [0, 1]."""
+    """Convert RGB to luma, rounded to 8 bits and returned as float32 (1, 1, H, W) in [0, 1]."""
     gray = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY))
     return torch.from_numpy(gray).to(device)[None, None].float() / 255.0
 

@@ -6,9 +6,9 @@ and rotated variants of one image are matched with the other image. All matches 
 matches of the matcher; a count of verified matches, the default, suits any matcher.
 
 Each variant is verified separately: most have the wrong rotation, and their random matches would
-outnumber the inliers of a common two-view model. Without known poses, a few random matches always
-fit some model, so all variants must agree with the model of the variant (or of the original images)
-with the most matches. Only matched keypoints are added to an image.
+outnumber the inliers of a common two-view model. Without known poses, even a few random matches fit
+some model; so only matches that also fit the model of the best variant (or of the original images)
+are kept. Only matched keypoints are added to an image.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.values import ImageFeatures, LocalFeatures, Options
 
 _SUFFIX = "-pyramid"
-# a scale limited by _MAX_SIDE_PX is omitted below this ratio to the next smaller scale
+# a scale reduced to _MAX_SIDE_PX is dropped if it is less than this times the next smaller scale
 _MIN_STEP = 1.2
 
 Extract = Callable[[NDArray[np.uint8], NDArray[np.bool_] | None], LocalFeatures]
@@ -113,7 +113,7 @@ def _covered(length: int, scaled: int) -> tuple[NDArray[np.int64], NDArray[np.in
     return at * length // scaled, -((at + 1) * -length // scaled)
 
 
-# an image is not enlarged beyond this; memory grows with the pixels
+# an image is not enlarged beyond this, which limits memory
 _MAX_SIDE_PX = 1600
 
 
@@ -146,14 +146,14 @@ class GuidedPyramidOptions(Options):
     @classmethod
     def _positive(cls, scales: tuple[float, ...]) -> tuple[float, ...]:
         if not all(0 < scale <= 16 for scale in scales):
-            raise ValueError("a scale is greater than 0 and at most 16")
+            raise ValueError("scales must be greater than 0 and at most 16")
         return tuple(sorted(set(scales)))
 
     @field_validator("rotations_deg")
     @classmethod
     def _quarters(cls, rotations: tuple[int, ...]) -> tuple[int, ...]:
         if any(rotation % 90 for rotation in rotations):
-            raise ValueError("rotations are multiples of 90 degrees")
+            raise ValueError("rotations must be multiples of 90 degrees")
         return tuple(sorted({rotation % 360 for rotation in rotations}))
 
     def is_hard(self, num_found: int, num_verified: int) -> bool:
@@ -193,7 +193,7 @@ def equivalent_types(local_type: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class VariantFeatures:
-    """Features of a variant in its pixels; keypoints float32 (N, C) in pixels of the original."""
+    """Features in pixels of the variant; ``keypoints_px``, float32 (N, C), in the original's."""
 
     variant: ImageVariant
     features: ImageFeatures

@@ -35,8 +35,9 @@ def combine(
 
     The base matches (K, 2) come first. Then come the variants, those with the most matches first,
     and the matches of each by score; keypoints that already have a match are skipped. With ``max``,
-    the variant with the most matches replaces the base if it has more. The second image needs no
-    union if it has no variants. Returns int64 (K, 2) and scores float64 (K,).
+    the variant with the most matches replaces the base if it has more. ``keypoints`` has one union
+    per image; that of the second may be omitted if it has no variants. Returns int64 (K, 2) and
+    scores float64 (K,).
     """
     matches, scores = base
     richest_first = sorted(tried, key=lambda each: -len(each[1]))
@@ -85,7 +86,7 @@ def _extended(
 class KeypointUnion:
     """Base keypoints float32 (N, C), followed by added ones with their ``descriptors`` (D,).
 
-    A keypoint is identical to the nearest one within a pixel; base keypoints precede added ones.
+    A keypoint counts as the same as the nearest one within a pixel, base keypoints first.
     """
 
     def __init__(self, base: Float32) -> None:

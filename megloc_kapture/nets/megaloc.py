@@ -52,7 +52,7 @@ class MegaLocNet(nn.Module):
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Return unit-norm vectors float32 (B, 8448) of RGB images (B, 3, H, W) in [0, 1].
 
-        Both sides are multiples of 14, with more patches than clusters.
+        Sides are cropped to multiples of 14; there must be more patches than clusters.
         """
         aggregated = self.aggregator["agg"](*self.backbone(imagenet_normalised(image)))
         return functional.normalize(self.aggregator["linear"](aggregated).float(), dim=1)
@@ -192,7 +192,7 @@ class DinoV2(nn.Module):
 
 
 class Block(nn.Module):
-    """Transformer block with a learnt factor per channel (Touvron et al., ICCV 2021)."""
+    """Transformer block with LayerScale (Touvron et al., ICCV 2021)."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()

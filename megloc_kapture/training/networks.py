@@ -1,4 +1,4 @@
-"""Trained networks, their loss and their metrics on held-out pairs.
+"""The networks to train, their loss, and their metrics on held-out pairs.
 
 SuperGlue is trained on frozen features, or a descriptor network is trained with a frozen detector,
 as in MegLoc (section "local features").
@@ -63,7 +63,7 @@ class PreparedPair:
 
 
 class SuperPointDescriber(nn.Module):
-    """SuperPoint's backbone and descriptor head, saved for the option ``descriptor_weights``."""
+    """SuperPoint's backbone and descriptor head, which ``descriptor_weights`` loads."""
 
     def __init__(self, extractor: SuperPoint) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ def describer_of(extractor: LocalFeatureExtractor) -> SuperPointDescriber | XFea
     if isinstance(extractor, XFeat):
         return XFeatDescriber(extractor)
     raise OptionError(
-        f"descriptors of superpoint and xfeat can be trained, not those of {extractor.name}"
+        f"only descriptors of superpoint and xfeat can be trained, not those of {extractor.name}"
     )
 
 
@@ -132,8 +132,9 @@ class ProductHead(nn.Module):
 def begin_at_products(net: SuperGlueNet) -> None:
     """Initialise a new SuperGlue to match by products of descriptors, as :class:`ProductHead` does.
 
-    The last layers of the keypoint encoder and of the messages are zero, as in residual branches
-    that begin at zero (Bachlechner et al., UAI 2021). The final projection is a scaled identity.
+    The last layers of the keypoint encoder and of the message networks are zeroed, like residual
+    branches that begin at zero (Bachlechner et al., UAI 2021). The final projection is a scaled
+    identity.
     """
     perceptrons = [module for module in net.modules() if isinstance(module, nn.Sequential)]
     for last in (net.final_proj, *(perceptron[-1] for perceptron in perceptrons)):
@@ -149,7 +150,7 @@ def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
     """Return the layer sizes of SuperGlue's keypoint encoder, in the official proportions."""
     if descriptor_size % 8:
         raise OptionError(
-            f"SuperGlue takes descriptors of a multiple of 8 dimensions, not {descriptor_size}"
+            f"SuperGlue needs a descriptor size that is a multiple of 8, not {descriptor_size}"
         )
     return tuple(descriptor_size // part for part in (8, 4, 2, 1, 1))
 
@@ -171,7 +172,7 @@ class PairModel(nn.Module):
         self.head, self.describer, self._iterations = head, describer, iterations
 
     def forward(self, pairs: Sequence[PreparedPair]) -> torch.Tensor:
-        """Return the mean loss () of pairs, 0 for pairs with an image without keypoints."""
+        """Return the mean loss, a scalar; a pair with an image without keypoints counts as 0."""
         usable = [pair for pair in pairs if pair.usable]
         if not usable:
             return 0.0 * next(self.head.parameters()).sum()
@@ -207,7 +208,7 @@ class PairModel(nn.Module):
 
 
 def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor:
-    """Return the negative log likelihood () of labels for log assignments (N + 1, M + 1).
+    """Return the scalar negative log likelihood of labels for log assignments (N + 1, M + 1).
 
     This is SuperGlue's equation 10, but with equal weights for the mean over matched and the mean
     over unmatched keypoints, as in LightGlue's equation 9. Ignored keypoints do not count.

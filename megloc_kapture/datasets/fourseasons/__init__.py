@@ -248,12 +248,12 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
                 source = owner
             if source is None:
                 raise DataError(
-                    "the file name lacks the reference recording; move the file into the "
-                    "folder of the reference recording",
+                    "the file name does not say which recording is the reference; move the file "
+                    "into that recording's folder",
                     path=path,
                 )
             if path.name in files:
-                raise DataError(f"the same name as {files[path.name].path}", path=path)
+                raise DataError(f"has the same file name as {files[path.name].path}", path=path)
             files[path.name] = RelocalizationFile(path, source, target)
     return sorted(files.values(), key=lambda file: (file.source, file.path.name))
 
@@ -299,7 +299,7 @@ def select(
         sources,
         f"{len(recordings)} recordings, none for the map; a recording with published poses "
         "(GNSSPoses.txt or poses.txt) and another one for the queries are needed"
-        + (f"; the relocalization files name {absent[0]}" if files and absent else ""),
+        + (f"; the relocalization files refer to {absent[0]}" if files and absent else ""),
         path=root,
     )
     return Selection(

@@ -74,7 +74,7 @@ def select(
     """
     check_option(
         version == 2 or not (train_as_map or part != "all"),
-        "the options train_as_map and queries need version 2, but version 1 is imported; "
+        "the options `train_as_map` and `queries` need version 2, but version 1 is being imported; "
         "add robotcar_v2_test.txt, or set version=2",
     )
     wanted: Iterable[ImageKey] = queries.locations
@@ -108,7 +108,7 @@ def _of_moments(images: Iterable[ImageKey], others: Iterable[ImageKey]) -> list[
 
 
 def with_rig_of_model(car: KaptureData, poses: Mapping[ImageKey, RigidTransform]) -> KaptureData:
-    """Return the car with a rig estimated from the model's poses, if these suffice."""
+    """Return the car with a rig estimated from the reference model's poses, if they suffice."""
     members = rig_of_model(poses)
     fits = members and set(members) <= set(car.sensors)
     return replace(car, rigs={RIG_ID: members}) if fits else car
@@ -162,7 +162,7 @@ def query_truth(
 
 _ROOT = "rear"  # the rig's frame
 _MIN_MOMENTS = 10
-# some poses are wrong: rotations whose deviation exceeds this many medians are ignored
+# some poses are wrong: rotations are ignored if they deviate by more than this times the median
 _OUTLIER = 3.0
 _ROUNDS = 3
 
@@ -214,8 +214,8 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
             )
         require(
             cameras.setdefault(key.camera, image.camera) == image.camera,
-            f"camera {key.camera} differs from that of other images; all images of one side of the "
-            "car are rectified to the same camera",
+            f"camera {key.camera} has other intrinsics than in other images; the dataset's images "
+            "are rectified to one camera model per camera",
             path=image.file,
         )
         by_key[key] = image

@@ -233,13 +233,15 @@ def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
     assert missing_of(read(root)) == [root / "garage"]
     assert not missing_of(read(root, queries=SNOW))
     (root / DAY).rename(root / "renamed")
-    with pytest.raises(DataError, match=f"none for the map; .*the relocalization files name {DAY}"):
+    with pytest.raises(
+        DataError, match=f"none for the map; .*the relocalization files refer to {DAY}"
+    ):
         read(root, queries=SNOW)
     (root / "renamed").rename(root / DAY)
     shutil.rmtree(root / SNOW)
     assert missing_of(read(root)) == [root / "garage", root / SNOW]
     write(root / "relocalizationFile_garage.txt", f"{A} 1\n")
-    with pytest.raises(DataError, match="lacks the reference recording"):
+    with pytest.raises(DataError, match="does not say which recording is the reference"):
         read(root)
 
 
