@@ -42,7 +42,7 @@ def _texts(value: Any) -> tuple[str, ...]:
 
 
 class MegaDepthOptions(Options):
-    """Options of importing MegaDepth."""
+    """Options for importing MegaDepth."""
 
     # the command line parses 5001 as a number
     scenes: Annotated[tuple[str, ...], BeforeValidator(_texts)] = Field(
@@ -59,7 +59,9 @@ def import_megadepth(
 ) -> dict[str, int]:
     """Write scenes (default: all) as ``output/SCENE``; skip images with ordinal or no depth."""
     scenes = list(map(check_component, scenes)) or _scenes(root)
-    require(scenes, f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
+    require(
+        scenes, f"found neither {_UNDISTORTED}/<scene> nor {_SCENE_INFO}/<scene>.npz", path=root
+    )
     counts = {"scenes": 0, "images": 0, "without_depth": 0}
     for scene in scenes:
         images = list(_images(root, scene))

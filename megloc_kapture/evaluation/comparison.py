@@ -248,7 +248,7 @@ def evaluate_without_truth(
     if not results or len(set(labels)) != len(labels):
         raise OptionError("at least one result is needed, and labels must differ")
     images = sorted({i for r in results for i in r.images} if queries is None else set(queries))
-    require(images, "no query: the results name no image")
+    require(images, "there are no queries: the results contain no images")
     conditions = benchmark.conditions(images)
     members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
     thresholds = thresholds_from_pairs(benchmark.protocol.thresholds)

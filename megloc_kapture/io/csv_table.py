@@ -65,7 +65,7 @@ def write_csv_table(
 
 
 def append_csv_rows(path: Path, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
-    """Append rows to a table that grows until :func:`write_csv_table` replaces it."""
+    """Append rows to a provisional table, which :func:`write_csv_table` replaces later."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "a", encoding="utf-8", newline="") as file:

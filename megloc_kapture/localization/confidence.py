@@ -1,8 +1,9 @@
 """Confidence of a pose: the probability that it is right, estimated without ground truth.
 
-:func:`evidence_of` measures by how much the inliers exceed chance, their share of all matches and
-of the matchable points, their fit compared with that of the map's images, the uncertainty of the
-pose, and the viewpoints of the map images that observe them. :class:`Calibration` is a logistic
+:func:`evidence_of` measures how far the number of inliers exceeds chance, what share they are of
+all matches and of the points that could have been matched, how well they fit compared with the
+map's own images, the uncertainty of the pose, and the viewpoints of the map images that observe
+them. :class:`Calibration` is a logistic
 model of these terms; ``benchmarks/confidence.py`` fits its weights (``confidence.toml``).
 """
 
@@ -26,25 +27,25 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 Floats = NDArray[np.float64]
 _SAMPLE = 3  # matches that determine a pose
 _CELL = 0.01  # cell size as a share of the image's diagonal; a cell's matches count once
-# a handful of wrong map points can agree with each other, so poses that see fewer are doubtful
+# a few wrong points can agree by accident, so a pose that sees fewer points than this is doubtful
 _MIN_VISIBLE = 50
 _MAX_PROJECTED = 2048  # number of points that estimate the visible share
 _MIN_ERROR_PX = 0.5
 _MIN_NOISE_PX = 0.3  # smallest map noise, pixels of the query
-# largest usual ratio of an image's error to the map's noise, measured with more than _FEW inliers
+# upper end of the normal range of an image's error / the map's noise, given more than _FEW inliers
 _USUAL_RATIO, _FEW = 2.9, 20
-# tolerated shift of the camera by a wrong focal length, relative to the distance of the points
+# tolerated camera shift due to a wrong focal length, relative to the distance to the points
 _TOLERATED_SHIFT = 0.03
 
 TERMS: dict[str, str] = {
-    "surprise": "hardly more matches agree than by chance",
+    "surprise": "hardly more matches agree than would by chance",
     "agreement": "most matches contradict the pose",
     "matched_share": "few of the visible map points were matched",
     "residual": "the inliers fit badly",
     "misfit": "the inliers fit worse than the map's own images do",
     "deviation": "the inliers barely constrain the pose",
     "viewing_angle": "the map's images see these points from other directions",
-    "distance_ratio": "the map's images see these points from another distance",
+    "distance_ratio": "the map's images see these points from a very different distance",
     "support": "few map images agree with the pose",
 }
 """Terms of the model, with the reason to report if a term's contribution is the lowest."""
@@ -66,8 +67,9 @@ class MatchSources:
     noise : float64 (N, 2), the map's median reprojection error as an angle and in pixels; NaN if
         unknown.
     seen : per view the points (K, 3) observed by the cluster's map images.
-    displacements_rad : function of a pose that returns the angles between the inliers' projected
-        points and their image patches, see :func:`~.structure.displacements_rad`; or None.
+    displacements_rad : function that maps a pose to the angle between each inlier's projected point
+        and the place where its image patch was found (:func:`~.structure.displacements_rad`); or
+        None.
     """
 
     support: NDArray[np.int64]
@@ -126,8 +128,8 @@ def with_confidence(
     """Return the pose with its confidence and evidence, or a Failure if the confidence is too low.
 
     A wrong focal length shifts the camera (``misfit``, see :func:`~.focal_length.focal_misfit`).
-    If this shift exceeds 3 % of the distance to the points, the confidence is divided by the square
-    of their ratio.
+    If this shift exceeds 3 % of the distance to the points, the confidence is multiplied by
+    (3 % / shift)^2.
     """
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
@@ -143,7 +145,7 @@ def with_confidence(
     if confidence >= min_confidence:
         return replace(pose, confidence=confidence, evidence=evidence, remarks=remarks)
     return Failure(
-        f"confidence {confidence:.2g} of the pose, at least {min_confidence:g} is needed: "
+        f"the pose's confidence is {confidence:.2g}, but at least {min_confidence:g} is required: "
         f"{pose.num_inliers} of {pose.num_matches} 2D-3D matches agree, and {why}",
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
@@ -157,7 +159,8 @@ def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> f
 
     This is the a-contrario model (Moisan and Stival, IJCV 2004; for poses Moulon et al., ACCV
     2012): a wrong match is within r of its projection with a probability equal to the disc's share
-    of the image. The most surprising radius counts, and matches in one cell count once.
+    of the image. The radius with the fewest false alarms is used; matches in one cell count
+    once.
     """
     from scipy.special import gammaln
 
@@ -193,17 +196,17 @@ def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> f
 
 
 def _misfit(problem: PoseProblem, errors_px: Floats, pose: Pose, sources: MatchSources) -> float:
-    """Return by how much the inliers fit worse than the map's own images, at least 0.
+    """Return how much worse the inliers fit than the map's own images do, at least 0.
 
     A mirrored or similar scene has hundreds of inliers that almost fit. The ratio is the median of
     the inliers' reprojection errors divided by the errors expected from the noise of the map and
-    the covariances of the points. If the inliers' image patches are displaced less than their
-    keypoints, the ratio is that of the displacements, since at night detectors fire elsewhere. The
-    result is log(ratio / usual ratio) log(number / 20), or 0 if the map's noise is unknown.
+    the covariances of the points. Since detectors fire elsewhere at night, the displacements of the
+    inliers' image patches replace the reprojection errors if they are smaller. The result is
+    log(ratio / usual ratio) log(number / 20), or 0 if the map's noise is unknown.
     """
     lengths = np.diff(problem.starts)
     focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)
-    # expected noise in the query's pixels; the angle counts if the query has more pixels per radian
+    # expected noise in the query's pixels; as an angle if the query has more pixels per radian
     noise_rad, noise_px = sources.noise.T
     own_px = np.maximum(noise_rad * focals, np.maximum(noise_px, _MIN_NOISE_PX))
     # points of small parallax have larger errors in images from other viewpoints
@@ -240,7 +243,7 @@ def _viewpoints(ours: Floats, theirs: Floats) -> tuple[float, float]:
     """Return medians over the inliers' map observations.
 
     They are the viewing angle divided by 90 deg, and |log2| of the distance ratio. ``ours`` and
-    ``theirs`` (N, 3) lead from the points to the query's camera and to those of the map's images.
+    ``theirs`` (N, 3) are vectors from the points to the query's camera and to the map's cameras.
     """
     length, other = np.linalg.norm(ours, axis=1), np.linalg.norm(theirs, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -280,7 +283,7 @@ def calibrations() -> Mapping[str, Calibration]:
 
 
 def calibration_for(local_types: Collection[str]) -> Calibration:
-    """Return the calibration of the keypoints types, or of :data:`OF_ALL` if theirs differ."""
+    """Return the calibration that the keypoints types share, or else that of :data:`OF_ALL`."""
     known = calibrations()
     names = {
         next((name for name in known if name != OF_ALL and local_type.startswith(name)), OF_ALL)

@@ -77,11 +77,11 @@ class DatasetChoice:
             (check_root if self.adapter is None else self.adapter.check)(self.root)
 
     def has_truth(self) -> bool:
-        """Return False for kapture folders without true poses; others may have them (True)."""
+        """Return whether there are true poses; assumed for all datasets but kapture folders."""
         return self.root is None or self.adapter is not None or is_kapture(self.root / QUERY_GT)
 
     def has_query_depth(self) -> bool:
-        """Return whether a rig links depth maps to the queries (of kapture folders; else False)."""
+        """Return whether kapture folders have a rig that links depth maps to the queries."""
         return self.root is not None and self.adapter is None and _has_depth(self.root / QUERY)
 
     def has_map_depth(self) -> bool:
@@ -172,8 +172,8 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
     wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
     if tables is None and wanted not in plain:
         raise OptionError(
-            f"the rules of {dataset} are missing; give the imported dataset with --data (check), "
-            "or its megloc/ folder with --side-tables (submit)"
+            f"the protocol of {dataset} is missing; give the imported dataset (`megloc check "
+            "--data`) or its megloc/ folder (`megloc submit --side-tables`)"
         )
     official = {name for name in dataset_names() if name not in plain}
     check_option(
@@ -203,7 +203,7 @@ def choose_dataset(
         adapter = load_plugin(DATASETS, layout, options)
         check_option(not query_prefix, "--query-prefix is for datasets of kapture folders")
     elif options:
-        raise OptionError(f"dataset {name} has no import options: {', '.join(options)}")
+        raise OptionError(f"dataset {name} has no import options, but got {', '.join(options)}")
     twin = None
     if root is None and (name == SYNTHETIC or name.startswith(TWIN_PREFIX)):
         twin = twin_of(layout)
@@ -230,7 +230,9 @@ def has_model(choice: DatasetChoice) -> bool:
     try:
         if reference is not None:
             reference.check()
-    except MeglocError:  # the model's files are missing: without the model the check has passed
+    except (
+        MeglocError
+    ):  # the model's files are missing, since without the model the check has passed
         return False
     return reference is not None
 

@@ -118,7 +118,7 @@ def _extract(
     names = [image for image, _ in jobs]
     try:
         return extract_all(extractor, frames, names)
-    except DataError as error:  # of a plugin, which knows no names
+    except DataError as error:  # raised by a plugin, which does not know the names
         if error.path is not None:
             raise
         raise DataError(error.message, path=" or ".join(names)) from error
@@ -149,7 +149,7 @@ def read_stored_image(folder: KaptureFolder, image: str) -> NDArray[np.uint8]:
 
 
 def read_image_of(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """Read an image of the camera's size, uint8 (H, W, 3) RGB."""
+    """Read an image, uint8 (H, W, 3) RGB, and check that it has the camera's size."""
     image = read_image_rgb(path)
     check_size(image.shape[1::-1], camera, path)
     return image
@@ -169,7 +169,7 @@ def warn_of_other_size(
     local_type: str,
     root: Path,
 ) -> None:
-    """Warn if the keypoints (N, 2 or more) of images span another size than width and height."""
+    """Warn if the extent of keypoints (N, 2 or more) does not fit their images' (width, height)."""
     reach = [
         float((keypoints_px[:, :2] / np.array(size, np.float64)).max())
         for keypoints_px, size in spans

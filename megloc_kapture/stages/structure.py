@@ -163,7 +163,7 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
     for (timestamp, device), name in data.records_camera.items():
         if name in model.poses:
             sensor = model.sensors[name]
-            # images with a different camera share a new sensor
+            # a camera that is not among the sensors becomes a new one
             own_sensor = (
                 sensor if sensor in data.sensors else f"{device}_{data.record_of(sensor)[0]}"
             )
@@ -202,7 +202,7 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
 
 
 def _moved(model: Model, scale: float, turned: RigidTransform = _UNTURNED) -> Model:
-    """Return the model after the transform ``x -> turned(scale * x)`` of the world."""
+    """Return the model with world coordinates transformed by ``x -> turned(scale * x)``."""
     back = turned.inverse()
     poses = {name: pose.scaled(scale) @ back for name, pose in model.poses.items()}
     return replace(model, poses=poses)

@@ -61,8 +61,8 @@ def labels_of_views(
 ) -> Labels:
     """Label keypoints (N, 2) and (M, 2) by depth and poses.
 
-    A keypoint without depth is unmatched if its Sampson distance exceeds NEGATIVE_PX for every
-    keypoint of the other image that depth leaves ignored, else ignored.
+    A keypoint without depth is unmatched if its Sampson distance to every keypoint that is ignored
+    in the other image after the check by depth exceeds NEGATIVE_PX; otherwise it is ignored.
     """
     a_in_b, known_a, visible_a = reproject(px_a, a, b)
     b_in_a, known_b, visible_b = reproject(px_b, b, a)
@@ -120,7 +120,7 @@ def reproject(
 
 
 def overlap(a: PosedView, b: PosedView) -> float:
-    """Return the smaller of the two shares of an image's pixels with depth that the other sees."""
+    """Return the share of pixels with depth that the other image sees, for the image with less."""
     shares = []
     for view, other in ((a, b), (b, a)):
         size = view.camera.width, view.camera.height

@@ -143,9 +143,7 @@ def test_a_model_in_place_of_a_kapture_folder_is_named(megloc: Any, tmp_path: Pa
     (tmp_path / "model" / "sparse").mkdir(parents=True)
     (tmp_path / "model" / "sparse" / "points3D.bin").touch()
     command = ("pairs-mapping", "-i", tmp_path / "model", "-o", tmp_path / "pairs.txt")
-    megloc(*command).refused(
-        "model: not a kapture folder; there is a COLMAP model in .*/sparse, of"
-    )
+    megloc(*command).refused("model: not a kapture folder; .*/sparse has a COLMAP model, from")
 
 
 def test_images_without_poses_cannot_be_paired_by_poses(

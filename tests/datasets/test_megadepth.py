@@ -126,7 +126,7 @@ def test_a_scene_is_imported_by_its_table_of_plain_arrays(tmp_path: Path) -> Non
 
 def test_missing_scenes_and_wrong_tables_are_refused(tmp_path: Path) -> None:
     for scenes, message in (
-        ((), "neither Undistorted_SfM/SCENE nor scene_info/SCENE.npz"),
+        ((), "found neither Undistorted_SfM/<scene> nor scene_info/<scene>.npz"),
         (("0001",), r"no sparse/0 or sparse or sparse-txt in .*0001, and no .*0001\.npz$"),
         (("..",), "'..'"),
     ):

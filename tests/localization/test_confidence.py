@@ -107,7 +107,7 @@ def test_a_pose_of_random_matches_is_rejected() -> None:
     problem, pose, sources = scene(4, 600, noise_px=0.1)
     refused = with_confidence(problem, pose, sources, ERROR_PX, 0.5)
     assert isinstance(refused, Failure) and refused.num_inliers == pose.num_inliers
-    assert refused.reason.startswith("confidence 0")
+    assert refused.reason.startswith("the pose's confidence is 0")
     assert refused.confidence is not None and refused.confidence < 0.5
     assert isinstance(with_confidence(problem, pose, sources, ERROR_PX, 0.0), Pose)
 

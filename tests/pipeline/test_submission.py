@@ -345,7 +345,7 @@ def test_official_datasets_need_their_tables(tmp_path: Path) -> None:
         check_dataset("aachen", Protocol(dataset=name), tables=tmp_path)
     check_dataset("synthetic", Protocol(), tables=None)
     check_dataset("kapture", Protocol(dataset="my-own-scene"), tables=None)
-    with pytest.raises(OptionError, match="rules of aachen are missing; .*--side-tables"):
+    with pytest.raises(OptionError, match="protocol of aachen is missing; .*--side-tables"):
         check_dataset("aachen", Protocol(), tables=None)
 
 

@@ -20,7 +20,7 @@ from megloc_kapture.io.kapture.format import check_columns, format_table, read_r
 from megloc_kapture.io.text_lines import camera_of, numbers_of
 from megloc_kapture.values import Camera, RigidTransform
 
-# a quaternion whose length differs from 1 by less than this (few digits in the text) is normalised
+# files may have few digits: a quaternion is normalised if its length is within this of 1
 MAX_QUATERNION_ERROR = 1e-3
 # a length within this of 1 is due to rounding; normalising would only change the last bits
 _QUATERNION_ROUNDING = 1e-14
@@ -76,7 +76,8 @@ _Index = tuple[tuple[int, int], dict[str, tuple[int, str]], dict[str, list[str]]
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
 
-    After the first look-up of an image, ``records_camera`` and ``rigs`` may only get new entries.
+    After the first look-up of an image, entries of ``records_camera`` and ``rigs`` may be added,
+    but not changed or removed.
 
     Attributes
     ----------
@@ -164,7 +165,7 @@ def read_kapture_data(root: Path) -> KaptureData:
     """Read and check ``sensors/`` of a kapture; only sensors.txt must exist."""
     folder = root / "sensors"
     require(root.exists(), "no such kapture folder", path=root)
-    require(root.is_dir(), "a file; give a kapture folder", path=root)
+    require(root.is_dir(), "this is a file; give a kapture folder", path=root)
     if not folder.is_dir():
         inner = ", ".join(sorted(p.parents[1].name for p in root.glob("*/sensors/sensors.txt")))
         if inner:
@@ -172,15 +173,15 @@ def read_kapture_data(root: Path) -> KaptureData:
         # nerfstudio has colmap/sparse/0, COLMAP's dense reconstruction dense/0/sparse
         if models := sorted(path.parent for path in find_near(root, "points3D.*")):
             raise DataError(
-                f"not a kapture folder; there is a COLMAP model in {models[0]}, of which `megloc "
-                "import colmap` makes a map",
+                f"not a kapture folder; {models[0]} has a COLMAP model, from which `megloc import "
+                "colmap` makes a map",
                 path=root,
             )
         raise DataError(
-            "not a kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
-            "--images` localizes them, `megloc map` maps them. A COLMAP model? `megloc "
-            "import colmap` makes a map of it. Poses? `megloc evaluate` takes a model, or "
-            "a file with rows name qw qx qy qz tx ty tz of cam_from_world",
+            "not a kapture folder: sensors/sensors.txt is missing. For photographs, use `megloc "
+            "localize --images` or `megloc map`; for a COLMAP model, `megloc import colmap`; for "
+            "poses, `megloc evaluate`, which takes a model or a text file of cam_from_world with "
+            "lines 'name qw qx qy qz tx ty tz'",
             path=root,
         )
     paths = {
