@@ -40,7 +40,7 @@ _NAMES_SHOWN = 3
 
 # the server accepts names with .jpg and with .png for this dataset
 _ANY_ENDING = "robotcar"
-# dataset -> (folders in names, valid endings)
+# dataset -> (number of folders in a name, valid endings)
 _SHAPES: dict[str, tuple[int, tuple[str, ...]]] = {
     "aachen": (0, (".jpg",)),
     "inloc": (0, (".JPG",)),
@@ -52,7 +52,7 @@ _MIN_POSES = 3
 # largest number of poses compared in each convention, evenly spread over the file
 _SAMPLE = 500
 # a pose is near the map if its distance (see _frames) is at most _NEAR times the median in the best
-# convention, or at most _LEAST times the map's extent (directions then differ by about a degree)
+# convention, or at most _LEAST times the map's extent (about a degree if only directions differ)
 _NEAR, _LEAST = 2.0, 0.02
 
 
@@ -261,7 +261,7 @@ def _read_rows(
             continue
         if len(fields) != num_keys + 7:
             message = f"{counted(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
-            problem("columns", message + "; separated by blanks, not commas" * ("," in line))
+            problem("columns", message + "; separated by spaces, not commas" * ("," in line))
             if len(fields) < num_keys or "," in fields[0]:
                 continue
         key = " ".join(fields[:num_keys])
@@ -300,7 +300,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
                 continue
             likely = alike or candidates
             if len(likely) != 1:
-                message = f"{name} is no known query"
+                message = f"{name} is not a known query"
                 findings.append(Finding("error", "unknown", message, line=line, names=(name,)))
                 continue
             right = wrong[name] = likely[0]
@@ -403,8 +403,8 @@ def _check_poses(
     if better := better_conventions(shares):
         message = (
             f"{' or '.join(better)}: with this convention, {max(shares):.0%} of the poses are near "
-            f"the map's cameras, but only {shares[0]:.0%} as they are in the file; the format has "
-            "cam_from_world with x right, y down, z forward"
+            f"the map's cameras, but only {shares[0]:.0%} as they are in the file; the format "
+            "requires cam_from_world with x right, y down, z forward"
         )
         return [Finding("error", "convention", message)]
     centers = _centers([in_local(name, pose) for name, pose in poses.items()])
@@ -420,7 +420,7 @@ def _check_poses(
     if 2 * len(far) > len(names):
         message = (
             f"{len(far)} of {len(names)} poses are far from every map camera, and no usual "
-            f"convention explains it; are they in another frame or scale? {shown}"
+            f"convention explains it; are they in a different frame or scale? {shown}"
         )
         return [Finding("error", "far", message, names=far_names)]
     message = f"{counted(len(far), 'pose')} far from every map camera: {shown}"
@@ -434,8 +434,8 @@ def _centers(poses: Sequence[RigidTransform]) -> NDArray[np.float64]:
 def _frames(poses: Sequence[RigidTransform], length: float) -> NDArray[np.float64]:
     """Return the centre and the ends of the x and z axes of each camera, (N, 9).
 
-    The distance between two rows grows with the distance and with the angle of the two cameras.
-    ``length`` is that of the axes.
+    The distance between two rows grows with the distance and the angle between the two cameras.
+    ``length`` is the length of the axes.
     """
     centers = _centers(poses)
     axes = length * rotation_matrices(stack_poses(poses)[0])  # rows: camera's x, y, z in the world

@@ -55,10 +55,10 @@ Align = Literal["none", "se3", "sim3"]
 # a similarity transform always fits two camera centres exactly, so two poses that agree prove
 # nothing
 _MIN_AGREEING = 4
-# largest number of poses for the note that an alignment would fit
+# largest number of poses sampled to find out whether an alignment would fit
 _MOST_COMPARED = 500
-# a pose fits the truth in a convention if its errors are at most these: position as a share of the
-# extent of the true camera centres, and degrees
+# a pose fits the truth in a convention if its errors are at most these: position error as a share
+# of the extent of the true camera centres, rotation error in degrees
 _NEAR_SHARE, _NEAR_DEG = 0.1, 10.0
 
 Localized = Path | str | Mapping[str, Pose | Failure] | Mapping[str, RigidTransform]
@@ -112,7 +112,7 @@ def evaluate(
 def _threshold(given: Any) -> Threshold:
     if isinstance(given, Threshold):
         return given
-    check_option(np.iterable(given), f"thresholds are a list of (metres, degrees), got {given}")
+    check_option(np.iterable(given), f"thresholds must be (metres, degrees) pairs, got {given}")
     return Threshold.parse(given if isinstance(given, str) else ", ".join(map(str, given)))
 
 
@@ -228,7 +228,7 @@ def _read(
         if isinstance(source, Mapping):
             result = result_in_memory(source, label=label)
         else:
-            # if none are known, take those of the first result: pose files may spell them otherwise
+            # without known names, use the first result's: pose files may spell them differently
             names = images or (read[0].images if read else ())
             result = read_result(
                 source, benchmark, images=names, references=references, label=label
@@ -240,9 +240,9 @@ def _read(
 def _by_common_names(
     true_poses: Poses, results: Sequence[Result], known: Collection[str]
 ) -> tuple[Poses, list[Result]]:
-    """Rename true poses and results whose folders differ from each other's, so that no name fits.
+    """Rename images so that results and truth match, even if their leading folders differ.
 
-    True poses get the names of the results, unless these differ among themselves.
+    True poses are renamed if no result shares a name with them, then each result that shares none.
     """
     images = {image for result in results for image in result.images}
     if not images & true_poses.keys():
@@ -328,7 +328,7 @@ def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, s
         fits = number >= _MIN_AGREEING and 2 * number > len(images)
         if not fits or 2 * alignment.agreed_before.sum() > number:
             return result, ""
-        note = f"the results fit the truth after {kind}: --align sim3"
+        note = f"the results fit the truth after {kind}; use --align sim3"
         return result, f"{note} ({number} of {len(images)} poses agree)"
     target_from_source = alignment.target_from_source
     similarity = SimilarityTransform(

@@ -110,7 +110,7 @@ def pose_errors(
     posed = [i for i, name in enumerate(listed) if name in estimated]
     if posed:
         # compare world_from_cam by kapture's sequence of operations: errors then equal kapture's to
-        # the last bit, and a query exactly on a threshold counts alike
+        # the last bit, and a query exactly on a threshold is counted the same way
         quats, centers = invert(*stack_poses(estimated[listed[i]] for i in posed))
         true_quats, true_centers = invert(*stack_poses(truth[listed[i]] for i in posed))
         position_m[posed] = np.linalg.norm(centers - true_centers, axis=1)
@@ -128,7 +128,7 @@ def confidence_interval(
 
     It contains the true proportion with at least 95 % probability. Wilson's interval is narrower,
     but covers less near a recall of 1: 91 % for 98 queries and a true recall of 99.5 %. Queries
-    count as independent draws, although those of one drive are not quite independent.
+    are treated as independent draws, although those of one drive are not quite independent.
     """
     from scipy.special import betaincinv
 
@@ -273,7 +273,7 @@ class Bin:
 
 @dataclass(frozen=True, slots=True)
 class Confidence:
-    """The confidences of one result against the truth.
+    """The confidences of one result compared with the truth.
 
     Attributes
     ----------
@@ -366,7 +366,7 @@ def calibration_error(bins: Sequence[Bin]) -> float:
 
 
 def risk_by_score(scores: NDArray[np.float64], right: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the share of wrong poses (N,) among the 1 ... N best; ties count as their mean."""
+    """Return the share of wrong poses (N,) among the 1 ... N best; ties are averaged."""
     order = np.argsort(-scores, kind="stable")
     _, inverse, counts = np.unique(-scores, return_inverse=True, return_counts=True)
     wrong = np.bincount(inverse, weights=~right) / counts

@@ -92,11 +92,11 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     Rows with a number that is not finite or with a zero quaternion, which other tools write for
     failed queries, are left out with a warning. Tabs, commas, CRLF, backslashes in names, empty
     lines, comments, a header that names the columns, and up to three columns after the pose are
-    accepted: pseudo ground truth of 7-Scenes has a focal length there, ACE errors and inliers.
+    accepted: 7-Scenes' pseudo ground truth has a focal length there, ACE has errors and inliers.
     """
     text = read_text(path)
     if text.startswith("# kapture format"):
-        raise DataError("a file of a kapture folder; give the folder", path=path)
+        raise DataError("is a file of a kapture folder; give the folder", path=path)
     if not is_colmap_images(text):
         rows = _in_column_order(_rows(text))
     else:
@@ -108,8 +108,8 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
             further = 8 < len(fields) <= 11 and not fields[1].isdecimal()
             require(
                 len(fields) == 8 or further,
-                f"{len(fields)} columns instead of 8 ({COLUMNS}); write such rows of "
-                "cam_from_world if this is another form (KITTI, 7-Scenes, Cambridge Landmarks)",
+                f"{len(fields)} columns instead of 8 ({COLUMNS}); convert other formats "
+                "(KITTI, 7-Scenes, Cambridge Landmarks) to such rows of cam_from_world",
             )
             name = fields[0].replace("\\", "/")
             require(name not in poses, f"{name!r} is given twice")
@@ -133,7 +133,7 @@ def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _fields(line: str) -> list[str]:
-    """Split a row at blanks, or at commas or semicolons, as spreadsheets write it."""
+    """Split a row at white space, or at commas or semicolons, as spreadsheets write."""
     for separator in ";,":
         fields = [field.strip(' \t\r"') for field in line.split(separator)]
         if len(fields) >= 8 and not any(len(field.split()) > 1 for field in fields[1:]):
@@ -144,7 +144,7 @@ def _fields(line: str) -> list[str]:
 def _in_column_order(rows: Iterable[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
     """Choose the columns that a header names, as in ``poses.csv``; without one, keep all.
 
-    The first title is that of the names: pandas writes an index without a title before them.
+    Names are in the first column with a title: pandas may write an untitled index before it.
     """
     header: list[str] = []
     for number, fields in rows:
@@ -243,9 +243,9 @@ def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> Rigid
         first, last = (abs(math.hypot(*quat) - 1) for quat in (numbers[:4], numbers[3:]))
         require(
             first < 0.01 or not last <= 0.01,  # also if they are nan
-            f"{whose}: the quaternion is last, as in trajectories (TUM, EuRoC) of world_from_cam, "
-            "which `megloc export tum` and evo compare, and as in Cambridge Landmarks (camera "
-            "centre, then w x y z); a pose file has it first, w x y z, and cam_from_world",
+            f"{whose}: the quaternion is last, as in world_from_cam trajectories (TUM, EuRoC: use "
+            "`megloc export tum` and evo) and in Cambridge Landmarks (camera centre, then "
+            "w x y z); a pose file needs cam_from_world with the quaternion first, w x y z",
         )
     return checked_pose((qw, qx, qy, qz), (tx, ty, tz), whose)
 
@@ -267,7 +267,7 @@ def timestamp_of(image: str) -> int:
     """Return the timestamp in an image name of 4Seasons (``.../1600000000000000000.png``)."""
     stem = PurePosixPath(image).stem
     if not _TIMESTAMP.fullmatch(stem):
-        raise DataError(f"image {image!r} is not named after a timestamp, as MLAD's rows need")
+        raise DataError(f"image {image!r} is not named after a timestamp, as MLAD requires")
     return int(stem)
 
 

@@ -62,7 +62,7 @@ PROTOCOLS = {
 
 
 def protocol_of(name: str) -> Protocol:
-    """Return the protocol of a dataset; ``synthetic-X`` is scored like X with known truth."""
+    """Return the protocol of a dataset; ``synthetic-X`` is scored like X, but has known truth."""
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     layout = name.removeprefix(TWIN_PREFIX)

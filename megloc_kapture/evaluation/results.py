@@ -193,7 +193,7 @@ def read_result(
 
 
 def with_names_of(result: Result, images: Collection[str]) -> Result:
-    """Rename the queries of a result whose names differ from all of ``images`` by their folders."""
+    """Rename the queries of a result to ``images``, unless one already has such a name."""
     old = {*result.images, *result.statuses}
     if not old.isdisjoint(images):
         return result
@@ -280,7 +280,7 @@ def distinct_labels(sources: Sequence[Path]) -> list[str]:
 
 
 def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -> Poses:
-    """Transform poses of a workspace with another local frame to the truth's frame."""
+    """Transform poses from the local frame of their workspace to that of the truth."""
     side_tables = side_tables_near(result)
     result_world = world if side_tables is None else read_world(side_tables)
     if result_world.official_from_local == world.official_from_local:
@@ -303,7 +303,9 @@ def _read_mlad(
     if path.is_dir():
         files = {file: path / file for file in sorted(asked) if (path / file).is_file()}
         names = min(asked)
-        require(files, f"neither a kapture folder nor one with pose files ({names})", path=path)
+        require(
+            files, f"is neither a kapture folder nor a folder of pose files ({names})", path=path
+        )
     else:
         files = {path.name if path.name in asked else min(asked): path}
         require(

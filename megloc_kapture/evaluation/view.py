@@ -127,10 +127,9 @@ def view_data(
     Raise DataError if no camera has a pose. ``queries`` are ranked, worst first. Coordinates are
     float32, relative to ``origin``. A frustum (5, 3) has the camera's centre, then rays at depth 1
     through the upper left, upper right, lower right and lower left corner of the image; NaN without
-    a pose.
-    ``inliers`` (K, 3) are those of all queries, one after the other; ``drawn`` counts them per
-    query. Frames of points, cameras and queries are indices into ``frames``, of which one is shown
-    at a time. ``radius`` is that of the content initially in view.
+    a pose. ``inliers`` (K, 3) are those of all queries, one after the other; ``drawn`` counts them
+    per query. Frames of points, cameras and queries are indices into ``frames``, of which one is
+    shown at a time. ``radius`` is that of the content initially in view.
     """
     notes = list[str]()
     rng = np.random.default_rng(_SEED)

@@ -117,7 +117,7 @@ def test_a_recentred_map(check: Check) -> None:
     assert not check(lines_of(poses), recentred).findings
     forgotten = {name: world.pose_in_local(pose) for name, pose in poses.items()}
     error = only(check(lines_of(forgotten), recentred))
-    assert error.kind == "far" and "another frame or scale" in error.message
+    assert error.kind == "far" and "different frame or scale" in error.message
 
 
 def test_single_poses_that_are_far(check: Check) -> None:
@@ -135,7 +135,7 @@ GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
     ("line", "kind", "words"),
     [
         ("b.jpg 1 0 0 0 1.5 -0.2", "columns", "7 columns instead of 8 (name qw qx qy qz tx ty tz)"),
-        ("b.jpg, 0.6, 0.8, 0, 0, 1.5, -0.2", "columns", "separated by blanks, not commas"),
+        ("b.jpg, 0.6, 0.8, 0, 0, 1.5, -0.2", "columns", "separated by spaces, not commas"),
         ("# name qw qx qy qz tx ty tz", "comment", "no header"),
         ("b.jpg 0 0 0 0 1 -0.2 3", "pose", "b.jpg: rotation is not a unit quaternion (length 0)"),
         ("b.jpg 10 20 30 0.6 0.8 0 0", "pose", "the columns are name qw qx qy qz tx ty tz"),

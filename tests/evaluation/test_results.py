@@ -224,7 +224,7 @@ def test_arguments_from_python(world: Any, tmp_path: Path) -> None:
     assert "equal" not in str(evaluate(arrays, world.truth))
     wrong: Any
     for wrong, message in (
-        ({"thresholds": (0.1, 1)}, r"a list of \(metres, degrees\), got 0\.1"),
+        ({"thresholds": (0.1, 1)}, r"be \(metres, degrees\) pairs, got 0\.1"),
         ({"align": "sim"}, "align is 'sim'; give none, se3 or sim3"),
         ({"align": None}, "align is None; give"),
         ({"side_tables": tmp_path / "no"}, "no: no such folder"),
@@ -322,7 +322,7 @@ def test_alignment() -> None:
     moved = {name: world.pose_in_official(pose) for name, pose in true.items()}
     actual = evaluate(moved, true)
     assert actual.row().recall[-1].num_within == 0
-    assert "fit the truth after a similarity of scale 0.27027: --align sim3" in str(actual)
+    assert "fit the truth after a similarity of scale 0.27027; use --align sim3" in str(actual)
     assert evaluate(moved, true, align="sim3").row().recall[0].num_within == 10
     assert evaluate(moved, true, align="se3").row().recall[0].num_within < 10
     by_chance = dict(zip(true, list(true.values())[::-1], strict=True))
