@@ -285,9 +285,9 @@ def _confirm(
     fit: StereoFit,
     job: tuple[DepthRow, Mapping[str, NDArray[np.int32]]],
 ) -> tuple[DepthRow, dict[str, LiftedPoints]]:
-    """Write the depth that sources confirm; return the row with its share, and lifted points.
+    """Write the depth that sources confirm; return the row with its ``fill``, and lifted points.
 
-    A job has the row of an image, and its keypoints that observe a point, which are not lifted.
+    A job has an image's row and, by type, ids of keypoints that observe a point and are not lifted.
     """
     row, seen_of_type = job
     image, size = row.image, fit.max_size_px

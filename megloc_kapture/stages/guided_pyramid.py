@@ -101,11 +101,11 @@ def match_image_again(
 ) -> tuple[list[list[VariantMatches]], str]:
     """Extract the variants of an image and match them with other images.
 
-    Return the matches by image and variant, and the reasons of skipped variants.
+    Return the matches by image and variant, and why variants were skipped.
 
     Parameters
     ----------
-    pixels, mask : RGB (H, W, 3), and True = use (H, W) or None.
+    pixels, mask : RGB (H, W, 3); bool (H, W), True = use, or None.
     only_scaled : images to match with scaled, unrotated variants; their results come last.
     """
     every = method.options.variants(itself.camera.width, itself.camera.height)
@@ -136,7 +136,7 @@ def _described(skipped: Mapping[ImageVariant, str]) -> str:
 
 
 def _counts(tried: Sequence[tuple[int, int]]) -> dict[str, int]:
-    """Return counts for the log from numbers of matches, before and after, of the tried pairs."""
+    """Return counts for the log from the numbers of matches of each pair before and after."""
     return {
         "pairs_tried": len(tried),
         "pairs_gained": sum(after > before for before, after in tried),
@@ -190,7 +190,7 @@ class RetriedQuery:
 
     The added keypoints (A, C) and descriptors (A, D) follow those of the query. ``matches`` are in
     the order of the candidates. ``tried`` has the numbers of matches, before and after, of the
-    candidates that were matched again, ``skipped`` the reasons of skipped variants.
+    candidates that were matched again, ``skipped`` the reasons for skipping variants.
     """
 
     added_px: NDArray[np.float32]

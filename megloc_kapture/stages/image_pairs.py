@@ -123,7 +123,7 @@ class MappingPairsOptions(Options):
 def _seen_points(
     folder: KaptureFolder, images: Sequence[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the point ids and the rows of ``images``, (O,) each, of the observations."""
+    """Return the point id and the row in ``images`` of each observation, (O,) each."""
     check_points(folder, "pair images by co-visibility")
     row_of = {image: row for row, image in enumerate(images)}
     points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
@@ -133,7 +133,7 @@ def _seen_points(
         points.append(observations.point_ids[image_ids >= 0])
         seeing.append(image_ids[image_ids >= 0])
     point_ids = np.concatenate(points)
-    require(len(point_ids) != 0, "none of the images to pair observes its points", path=folder.root)
+    require(len(point_ids) != 0, "none of the images to pair observes a point", path=folder.root)
     return point_ids, np.concatenate(seeing)
 
 
@@ -248,7 +248,7 @@ def pair_queries(
             of_query[at] = [
                 ImagePair(queries[at], members[i], score)
                 for i, score in zip(row, row_scores, strict=True)
-                if i >= 0  # -1 where images are too few
+                if i >= 0  # -1 if there are too few images
             ]
     return list(chain(*of_query))
 

@@ -33,7 +33,7 @@ from megloc_kapture.io.kapture.points import rows_by_id
 _MAX_SHIFT_PX = 1.0
 # smallest proportion of observations with an extracted keypoint at their position
 _MIN_FOUND_AGAIN = 0.5
-# keypoints with equal positions and different orientations; positions differ only by rounding
+# keypoints that differ only in orientation have equal positions up to rounding
 _SAME_PLACE_PX = 0.1
 
 

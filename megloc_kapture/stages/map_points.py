@@ -34,8 +34,8 @@ def triangulate_map(
 ) -> dict[str, float]:
     """Triangulate with fixed poses and intrinsics, write the map, and return counts for the log.
 
-    Each keypoints type has separate points; those of the first type come first. ``pairs`` restrict
-    the matches.
+    Each keypoints type has separate points; those of the first type come first. If ``pairs`` are
+    given, only their matches are used.
     """
     types = tuple(dict.fromkeys(local_types))
     data = mapping.read()
@@ -127,8 +127,8 @@ def lift_map(
     with_depth = [image for image in images if image in records]
     require(
         with_depth,
-        "no mapping image has a pose and a depth map with its timestamp (records_depth.txt, a "
-        "rig with camera and depth sensor)",
+        "no mapping image has a pose and a depth map with its timestamp; this needs "
+        "records_depth.txt and a rig with camera and depth sensor",
         path=mapping.root,
     )
     points: list[NDArray[np.float64]] = []

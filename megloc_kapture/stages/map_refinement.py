@@ -337,7 +337,7 @@ def _compare(
     options: DepthVerificationOptions,
     job: tuple[str, Floats, Floats],
 ) -> tuple[Mask, int]:
-    """Return a mask of points that an image's depth contradicts, and the number of tested ones."""
+    """Return a mask of points that an image's depth contradicts, and how many it tests."""
     image, xyz, covariances = job
     depth, cam_from_world = depth_and_pose(folder, image)
     axis = (depth.image_from_depth.inverse() @ cam_from_world).rotation_matrix()[2]

@@ -56,7 +56,7 @@ CACHED_IMAGES = 80  # in each process; about 250 MB of RootSIFT
 _PAIRS_PER_ITEM = 32  # pairs of one image, whose features are read once
 # the given poses are checked against the matches within this number of image groups
 _CHECKED_GROUPS = 6
-# a group has one image, and those with these ranks among the images that are paired with it
+# a group has one image, and those with these ranks among its partners, the most similar first
 _RANKS = (0, 1, 3, 7, 15)
 
 
@@ -138,7 +138,7 @@ def match_pairs(
     A pair without verified matches is also written, which marks it as finished.
     """
     within_one = first.root == second.root
-    # within a map (a, b) and (b, a) are one pair, stored in one file, and (a, a) is none
+    # within a map (a, b) and (b, a) are one pair, stored in one file, and (a, a) is not a pair
     if within_one:
         ordered = sorted({one_way(pair) for pair in pairs if pair.query != pair.map})
     else:
@@ -344,7 +344,7 @@ def match_all(
         bounds = len(a.keypoints_px), len(other.keypoints_px)
         if ((matches < 0) | (matches >= bounds)).any():
             raise PluginError(
-                f"{who}: a match has a keypoint index outside {bounds[0]} and {bounds[1]} keypoints"
+                f"{who}: keypoint index out of range ({bounds[0]} and {bounds[1]} keypoints)"
             )
     return pairs
 

@@ -270,7 +270,7 @@ class FieldRefinerOptions(Options):
     )
     matcher: PluginChoice = Field(
         default=PluginChoice(name="nn", options={"max_ratio": 0.9}),
-        description="matcher of query and rendering",
+        description="matcher for query and rendering",
     )
     max_side_px: int = Field(
         default=320, ge=64, description="longer side of the rendering; larger queries are reduced"
@@ -297,7 +297,7 @@ class FieldRefiner:
         self.options = options or FieldRefinerOptions()
         check_option(
             self.options.field,
-            "the pose refiner field needs a field that megloc train-field wrote: --set "
+            "the pose refiner 'field' needs a folder written by megloc train-field: --set "
             '\'pose_refinement.by=[{name="field",options={field="FOLDER"}}]\'',
         )
         placement = NetworkOptions(

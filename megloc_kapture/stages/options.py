@@ -41,7 +41,7 @@ class LocalFeaturesChoice(PluginChoice):
     """A local feature extractor, its options, and the matcher of its features."""
 
     matching: PluginChoice | None = Field(
-        default=None, description="matcher of these features; none: the option matching of the run"
+        default=None, description="matcher of these features; none: the one set by matching"
     )
 
 

@@ -236,7 +236,7 @@ def apply_refiners(
             after = refined.cam_from_world
             w, x, y, z, t_x, t_y, t_z = map(float, (*after.quat_wxyz, *after.translation))
             if not abs(math.hypot(w, x, y, z) - 1) < 1e-3 or not math.isfinite(t_x + t_y + t_z):
-                raise PluginError(f"{who}: no rotation and position: {after}")
+                raise PluginError(f"{who}: refine returned an invalid pose: {after}")
             after = RigidTransform((w, x, y, z), (t_x, t_y, t_z))
             pose = replace(pose, cam_from_world=after, covariance=refined.covariance)
         moved_m, turned_deg = movement(before, after)

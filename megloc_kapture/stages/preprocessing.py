@@ -86,7 +86,7 @@ class MaskOptions(Options):
 def mask_files(
     folder: KaptureFolder, images: Iterable[str], user_masks: Path | None
 ) -> dict[str, dict[str, Path]]:
-    """Find mask files by image and source: ``own`` of the kapture, ``user`` of ``user_masks``."""
+    """Find mask files by image and source: ``own`` in the kapture, ``user`` in ``user_masks``."""
     if user_masks is not None and not user_masks.is_dir():
         raise DataError("no such folder of masks", path=user_masks)
     files_of = {}
@@ -280,7 +280,7 @@ def _process(
     classes: ClassMasks | None,
     job: tuple[str, Path, FramePlan, bool, Mapping[str, Path], Mapping[str, Mask]],
 ) -> dict[str, float]:
-    """Write one image and its mask; return the proportion of masked pixels by source and in all."""
+    """Write one image and its mask; return the share of masked pixels by source and overall."""
     image, source, plan, link, mask_paths, standing = job
     sensors, camera = output / "sensors", plan.original
     write = partial(write_image, jpeg_quality=JPEG_QUALITY)
@@ -403,7 +403,7 @@ def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureD
 
 
 def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:
-    """Link all records if no image changes, else only depth maps; return True if all."""
+    """Link all records if no image changes, else only depth maps; return whether all are."""
     records = folder.root / "sensors" / "records_data"
     if records.is_dir() and not any(plan.changes_pixels for plan in plans.values()):
         link_records(output, {"": records})

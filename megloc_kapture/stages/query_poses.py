@@ -59,7 +59,7 @@ _FIRST_TURN = 8  # candidates that are matched first; each further turn doubles 
 # with fewer inliers even a correct pose can be off by decimetres, and matching more candidates
 # improves it (docs/performance.md)
 _SURE_INLIERS = 30
-_WRONG_RIG = "joint localization: the rig's poses of its cameras contradict their matches"
+_WRONG_RIG = "joint localization is rejected: a camera's matches contradict the pose of the rig"
 
 
 class LocalizationOptions(Options):
@@ -181,7 +181,7 @@ def localize_query(
         return replace(localize([single], candidates)[0], name=view.name)
 
     def contradicts(of_rig: Pose | Failure, view: QueryView) -> bool:
-        """Return whether most matches of a camera agree on another pose than that of its rig."""
+        """Return whether most of a camera's matches agree on a different pose than its rig's."""
         if 2 * of_rig.num_inliers >= of_rig.num_matches:
             return False
         single = alone(view, of_rig.candidates)

@@ -35,8 +35,8 @@ class RerankingOptions(Options):
     )
     local_type: str | None = Field(
         default=None,
-        description="local features whose matches count, by type or plugin; none: all types "
-        "together",
+        description="type or plugin of the local features whose matches are counted; none: all "
+        "types together",
     )
     keep: int = Field(default=20, gt=0, description="number of candidates to keep, the paper's N")
 

@@ -33,7 +33,7 @@ _SAMPLED_IMAGES = 32
 
 def check_points(folder: KaptureFolder, purpose: str) -> None:
     """Raise DataError if a folder has no map points for a purpose, such as ``localize in``."""
-    folder.read()  # raises another message if this is no kapture folder
+    folder.read()  # raises a different error if this is not a kapture folder
     require(
         folder.has_points(),
         f"no map to {purpose}: reconstruction/points3d.txt or observations.txt is missing; "
@@ -223,7 +223,7 @@ def _siblings_on_rig(
 ) -> Callable[[int, str], Iterator[tuple[str, str, RigidTransform]]]:
     """Return a function of timestamp and sensor that yields the records on the same rig.
 
-    It yields other sensor, path and ``sensor_from_other``.
+    It yields the other sensor, the path and ``sensor_from_other``.
     """
     mounts = _mounts(data)
     at_time: dict[int, list[tuple[str, str]]] = {}

@@ -139,7 +139,7 @@ def ordered_map(
     if isinstance(executor, ProcessPoolExecutor):
         try:
             pickle.dumps(function)
-        except Exception as error:  # of a plugin's class, or of what it holds
+        except Exception as error:  # plugins define how they are pickled
             raise PluginError(
                 f"a plugin cannot be sent to other processes: {error}; let a function with "
                 "functools.lru_cache create such objects, or use --executor inline"
@@ -175,7 +175,7 @@ class Batched(Generic[Item, Result]):
     read : reads the arrays of an item.
     compute : returns one result per item; calls ``plugin``.
     many : name of the plugin's batch method.
-    alike : key of an item; consecutive items with equal keys share a batch. None: one item each.
+    alike : key of an item; consecutive items with equal keys share a batch. None: batches of one.
     finish : optional last step for an item and its result; needs no device.
     """
 
@@ -205,7 +205,7 @@ class Work:
     executor : None means this process.
     num_threads : number of threads of libraries with internal threads, such as COLMAP.
     resume : skip items whose output files an interrupted run has written.
-    force : continue although most given poses contradict the matches.
+    force : continue even if most given poses contradict the matches.
     placement : device and precision of networks.
     """
 

@@ -381,7 +381,7 @@ def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_pa
     for name in ("nan", "long"):
         wrong = Chosen(refiners=(Shift(name=name),))
         with pytest.raises(
-            PluginError, match=f"'{name}' on image .*: no rotation and position: Rig"
+            PluginError, match=f"'{name}' on image .*: refine returned an invalid pose: Rig"
         ):
             refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
 
