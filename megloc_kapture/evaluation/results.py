@@ -113,13 +113,14 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         path = next((path for path in folders if is_kapture(path)), None)
         return None if path is None else KaptureFolder(path, features_dirs=features)
 
+    units = map(unit_of, filter(None, (workspace or folder, mapping)))
     return ResultContext(
         queries=first(queries),
         mapping=KaptureFolder(mapping, features_dirs=features) if mapping else first(maps),
         frames={image: g.frame for image, g in side_tables.groups.items() if g.frame},
         refinements=_if_there(_read_refinement, folder / tables.REFINEMENT_FILE) or {},
         consistency=read_records(folder / tables.CONSISTENCY_FILE, ConsistencyRow, missing_ok=True),
-        unit=unit_of(workspace or folder),
+        unit=next((unit for unit in units if unit != METRES), METRES),
     )
 
 

@@ -70,6 +70,11 @@ def test_positions_in_a_map_of_unknown_scale_are_in_units_of_the_map(
     done = megloc("evaluate", "-i", localized, *truth)
     assert "0.0 / 0.0" in done.out and "after a similarity of scale" in done.out
     assert "units of a map of unknown scale" in caplog.text
+    # of a pose file alone, the map has the unit
+    caplog.clear()
+    shutil.copyfile(localized / "poses.csv", tmp_path / "poses.csv")
+    megloc("evaluate", "-i", tmp_path / "poses.csv", *truth, "--map", workspace / "map")
+    assert "units of a map of unknown scale" in caplog.text
     done = megloc("evaluate", "-i", localized, *truth, "--align", "sim3")
     assert "4 of 4 poses" in done.out and "100.0" in done.out
     assert json.loads(map_overview(KaptureMap.open(workspace / "map")))["unit"] == "units"
