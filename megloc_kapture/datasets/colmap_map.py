@@ -67,7 +67,7 @@ class ColmapFolders:
 
 
 def is_colmap(path: Path) -> bool:
-    """Return whether a folder is a COLMAP model or workspace, and not a kapture."""
+    """Return whether a folder is a COLMAP model or workspace and not a kapture folder."""
     path = Path(path)
     return not is_kapture(path) and bool(_models(path))
 
@@ -205,7 +205,7 @@ class ColmapReconstruction:
                 local_type = None if feature_type is None else feature_type[0]
         if not len(self.model.points.image_ids):
             what = "points without tracks" if len(self.model.points) else "no points"
-            hint = "give `megloc import colmap` the images to make them from (--images)"
+            hint = "to triangulate new ones, give its images with `megloc import colmap --images`"
             require(source.images, f"the model has {what}; {hint}", path=source.model)
             _log.warning(_MAPPED_AGAIN, source.model, f"the model has {what}")
             return None
@@ -243,7 +243,7 @@ class ColmapReconstruction:
         with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
             reference, images, sift = (Path(scratch) / n for n in ("reference", "images", _SIFT))
             self._write_reference(reference, keypoints_type=_SIFT)
-            # a separate kapture: in the reference, the model's keypoints would take precedence
+            # a separate folder: in the reference, the model's keypoints would take precedence
             self.write_images(images)
             mapping = KaptureFolder(images, features_dirs=[sift])
             extractor = load_plugin(LOCAL_FEATURES, _SIFT)
@@ -312,7 +312,7 @@ def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
         if name in taken:
             raise DataError(
                 f"images {taken[name]!r} and {image.name!r} would both be {name!r} in kapture, "
-                "which cannot hold commas in names",
+                "whose names cannot have commas, outer spaces or a leading #",
                 path=folder,
             )
         taken[name] = image.name

@@ -38,13 +38,13 @@ _log = logging.getLogger(__name__)
 Key = TypeVar("Key")
 
 _NO_POSE = (
-    "no image has a pose: sensors/trajectories.txt is missing, or has other timestamps or sensors "
-    "than records_camera.txt"
+    "no image has a pose: sensors/trajectories.txt is missing, or its timestamps or sensors are "
+    "not those of records_camera.txt"
 )
 
 
 def check_root(root: Path) -> Path:
-    """Check that ``root`` has a mapping/ and a query/ kapture, and return it."""
+    """Check that ``root`` has kapture folders mapping/ and query/, and return it."""
     root = Path(root)
     require(root.is_dir(), "no such folder", path=root)
     for part in (MAPPING, QUERY):
@@ -80,7 +80,7 @@ def checked_folders(
     _map_poses(mapping)
     require(query_data.records_camera, "there are no query images", path=query.root)
     photographs = query.root / "sensors" / "records_data"
-    require(photographs.is_dir(), "no such folder; it must have the images", path=photographs)
+    require(photographs.is_dir(), "no such folder; it must contain the images", path=photographs)
     renamed = map(prefixed(query_prefix), query_data.image_names())
     shared = sorted(set(map_data.image_names()) & set(renamed))
     if shared:
@@ -99,8 +99,8 @@ def _check_truth(folder: Path, queries: Sequence[str]) -> None:
     require(true_poses, f"{_NO_POSE}; delete the folder if true poses are unknown", path=folder)
     require(
         not true_poses.keys().isdisjoint(queries),
-        f"its {len(true_poses)} images with poses, such as {min(true_poses)!r}, are not queries, "
-        f"such as {queries[0]!r}",
+        f"none of its {len(true_poses)} images with poses (such as {min(true_poses)!r}) is a query "
+        f"(such as {queries[0]!r})",
         path=folder,
     )
 
@@ -108,7 +108,7 @@ def _check_truth(folder: Path, queries: Sequence[str]) -> None:
 def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") -> dict[str, float]:
     """Check the folders of ``root``, rewrite them below ``output``, and link the images.
 
-    ``query_prefix`` is prepended to all query names, so that map and queries share none.
+    ``query_prefix`` is prepended to all query names, so that map and queries share no names.
     """
     mapping, map_data, query, query_data = checked_folders(root, query_prefix)
     rename = prefixed(query_prefix)
@@ -131,7 +131,7 @@ def import_kapture_folders(root: Path, output: Path, *, query_prefix: str = "") 
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)
     elif query_data.trajectories:
-        _log.warning("%s: has poses; only those in query_gt/ count as true poses", query.root)
+        _log.warning("%s: its poses are ignored; true poses belong in query_gt/", query.root)
     tables = _renamed_tables(read_side_tables(root / SIDE_TABLES), rename, map_data, query_data)
     write_side_tables(output / SIDE_TABLES, tables)
     return {
@@ -196,7 +196,7 @@ def cameras_of_images(
     """Compare cameras with the image sizes in the files' headers; unreadable files are skipped.
 
     Return the scaled cameras and the errors. A camera is scaled if exactly one of the sizes of its
-    images has its aspect ratio, up to rounding. Every image of another size gives an error.
+    images has its aspect ratio, up to rounding. Every image of a different size gives an error.
     """
     of_camera: dict[Key, dict[tuple[int, int], list[Path]]] = {}
     for key, path in images:
@@ -225,7 +225,7 @@ def is_scaled(camera: Camera, size: tuple[int, int]) -> bool:
 
 
 def fitted_camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Scale a camera to an image of another size but the same aspect ratio."""
+    """Scale a camera to an image of a different size, if it has the same aspect ratio."""
     is_other = size != (camera.width, camera.height)
     return scaled_camera(camera, *size) if is_other and is_scaled(camera, size) else camera
 
@@ -291,7 +291,7 @@ def _renamed_tables(
     for name, group in tables.groups.items():
         if name in of_query:
             groups[rename(name)] = group
-        # an image name that occurs in map and queries has its group in both
+        # if map and queries share an image name, both get its group
         if name in of_map or name not in of_query:
             groups[name] = group
     return replace(

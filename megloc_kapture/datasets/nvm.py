@@ -110,6 +110,6 @@ def _parse_points(lines: list[str], images: int) -> SparsePoints:
         and np.isfinite(values).all()
         and (seen[:, :2] >= 0).all()
         and (seen[:, 0] < images).all(),
-        f"malformed point or unknown image, from {lines[0][:40]!r} on",
+        f"a point is malformed or names an unknown image, in or after the line {lines[0][:40]!r}",
     )
     return SparsePoints.of_rows(heads[:, :6], heads[:, 6], seen)

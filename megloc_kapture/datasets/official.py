@@ -60,11 +60,14 @@ class DatasetCard(Options):
         remedy = f"the root must contain {self.layout}{packed}"
         if found is not None:
             remedy = f"there is one in {found}/: give it as the root"
-        return DataError(f"not {self.title}, no folder {' and '.join(absent)}; {remedy}", path=root)
+        return DataError(
+            f"this is not {self.title}, as there is no folder {' or '.join(absent)}; {remedy}",
+            path=root,
+        )
 
 
 def kapture_hint(root: Path) -> str:
-    """Return the remedy for kapture folders of a dataset that is read in its layout only."""
+    """Return a remedy, if any, for kapture folders of a dataset read only in its own layout."""
     has_map = is_kapture(root / MAPPING)
     return "; kapture folders can be evaluated as dataset kapture" if has_map else ""
 
@@ -122,14 +125,14 @@ class Missing:
         more = len(parts) - _MISSING_SHOWN
         raise DataError(
             f"{len(self.files)} files are missing: {', '.join(parts[:_MISSING_SHOWN])}"
-            + (f", and files of {more} more folders" if more > 0 else "")
+            + (f", and files in {more} more folders" if more > 0 else "")
             + self._found(self._shown(self.files[0]).parts)
             + "; --allow-missing imports the rest",
             path=self.root,
         )
 
     def _found(self, parts: tuple[str, ...]) -> str:
-        """Return where a missing file is: in an archive, or in a folder too deep or too high."""
+        """Return where a missing file may be: in an archive, or one or more folders up or down."""
         for path in archives(self.root):
             if path.name.startswith(parts[:-1]):
                 return f"; is {path} extracted?"
@@ -146,7 +149,7 @@ class Missing:
 
 
 def _in_order(parts: Sequence[str], others: Sequence[str]) -> bool:
-    """Return whether ``others`` has all ``parts``, except for their case, in the same order."""
+    """Return whether ``others`` contains all ``parts`` in the same order, ignoring case."""
     rest = iter(other.lower() for other in others)
     return all(part.lower() in rest for part in parts)
 
@@ -185,7 +188,7 @@ def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> 
     )
     shared = set(dataset.mapping.image_names()) & set(dataset.query.image_names())
     if shared:
-        raise DataError(f"image {min(shared)!r} is in the map and a query", path=root)
+        raise DataError(f"image {min(shared)!r} is both a map image and a query", path=root)
 
 
 def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: bool = False) -> None:

@@ -1,7 +1,7 @@
-"""A dataset's sparse model, in which hloc and others localize, as a kapture map; COLMAP databases.
+"""Conversion of a dataset's sparse model, which hloc localizes in, to a kapture map.
 
-pycolmap opens databases for writing: it adds tables to the user's file and fails in read-only
-folders. Here databases are opened as ``immutable``, which creates no files even in WAL mode.
+pycolmap opens COLMAP's databases for writing: it adds tables to the user's file and fails in
+read-only folders. Here they are opened as ``immutable``, which creates no files even in WAL mode.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         log = self.path.with_name(self.path.name + "-wal")
         if log.is_file() and log.stat().st_size:
             raise DataError(
-                f"was not closed: the content of {log.name} is not in it yet; open and close it "
-                "once with COLMAP or sqlite3",
+                f"the database was not closed, so it lacks the content of {log.name}; open and "
+                "close it once with COLMAP or sqlite3",
                 path=path,
             )
         uri = f"file:{quote(str(self.path.resolve()))}?mode=ro&immutable=1"
@@ -76,7 +76,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         self._connection.close()
 
     def name_of(self, image: str) -> str | None:
-        """Return the stored name of an image, which may have another suffix."""
+        """Return the image's name in the database, which may have a different suffix."""
         return image if image in self.images else self._by_stem.get(_without_suffix(image))
 
     def keypoints(self, name: str) -> NDArray[np.float32]:
@@ -85,9 +85,9 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         return np.empty((0, 2), np.float32) if rows is None else np.ascontiguousarray(rows[:, :2])
 
     def feature_type(self) -> tuple[str, str] | None:
-        """Return type name and dtype of all features, or None without descriptors.
+        """Return type name and dtype of all features, or None if there are no descriptors.
 
-        Tools that match by themselves store zeros in place of descriptors.
+        Tools with a matcher of their own store zeros instead of descriptors.
         """
         with self._reading():
             first = next(self._rows("SELECT data FROM descriptors WHERE rows > 0"), None)
@@ -97,13 +97,13 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             if any(column[1] == "type" for column in columns):
                 rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
                 kinds = {int(kind) for (kind,) in rows}
-            else:  # older versions of COLMAP store no type: SIFT, or imported features
+            else:  # older versions of COLMAP store no type: SIFT if 128 columns, else imported
                 rows = self._rows("SELECT DISTINCT cols FROM descriptors WHERE rows > 0")
                 kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for (size,) in rows}
         types = [_TYPES.get(kind) or (f"colmap-{kind}", "u1") for kind in kinds]
         if len(types) > 1:
             names = ", ".join(sorted(name for name, _ in types))
-            raise self._error(f"has descriptors of several types: {names}")
+            raise self._error(f"the database has descriptors of several types: {names}")
         return types[0] if types else None
 
     def descriptors(self, name: str, dtype: str = "u1") -> NDArray[Any] | None:
@@ -112,13 +112,13 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
 
     def _array(self, table: str, name: str, dtype: str) -> NDArray[Any] | None:
         if name not in self.images:
-            raise self._error(f"has no image {name!r}")
+            raise self._error(f"the database has no image {name!r}")
         query = f"SELECT rows, cols, data FROM {table} WHERE image_id = {self.images[name]:d}"
         with self._reading():
             rows, columns, content = next(self._rows(query), (0, 0, b""))
             if not rows:
                 return None
-            # descriptor columns count bytes
+            # for descriptors, the number of columns is in bytes
             size = columns // np.dtype(dtype).itemsize if table == "descriptors" else columns
             array = np.frombuffer(content, dtype).reshape(rows, size)
         if not np.isfinite(array).all():
@@ -194,7 +194,7 @@ def write_reference_map(
             feature_type = source.feature_type() or (keypoints_type, "u1")
             require(
                 feature_type[0] == keypoints_type,
-                f"has features of type {feature_type[0]}, not {keypoints_type}",
+                f"the database has features of type {feature_type[0]}, not {keypoints_type}",
                 path=database,
             )
             stored = {
@@ -249,14 +249,18 @@ def _keypoints_of(
         _, first, rows = np.unique(features, return_index=True, return_inverse=True)
         return xy_px[first], rows
     if stored is None:
-        require(not len(features), f"has no image {name!r}", path=database.path)
+        require(not len(features), f"the database has no image {name!r}", path=database.path)
         return np.empty((0, 2), np.float32), features
     keypoints = database.keypoints(stored)
     fits = features.max(initial=-1) < len(keypoints)
     if fits:
         shifts = np.abs(keypoints[features] - xy_px)
         fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
-    require(fits, f"does not fit this model: features of {stored!r} differ", path=database.path)
+    require(
+        fits,
+        f"the database does not fit this model: the keypoints of {stored!r} differ",
+        path=database.path,
+    )
     return keypoints, features
 
 
@@ -267,7 +271,7 @@ def _write_descriptors(
     lengths: Mapping[str, int],
     sources: Mapping[str, str],
 ) -> None:
-    """Write descriptors of images with ``lengths`` keypoints; ``sources`` are the stored names."""
+    """Write descriptors; by image, ``lengths`` counts keypoints, ``sources`` has stored names."""
     (kind, dtype), size = feature_type, 0
     writer: FeatureWriter | None = None
     # images without keypoints come last: their empty files need the descriptor size of the others

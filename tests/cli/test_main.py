@@ -94,7 +94,7 @@ def test_a_kapture_folder_without_the_name_of_its_dataset_is_no_aachen(
     megloc: Any, scene: Path, tmp_path: Path
 ) -> None:
     command = ("eval", "--root", scene, "--workspace", tmp_path / "run", "-q")
-    megloc(*command).refused("in its name; `megloc eval kapture` is for other datasets")
+    megloc(*command).refused("in its name; `megloc eval kapture` is for datasets other")
 
 
 def test_a_full_disk_is_no_internal_error() -> None:

@@ -72,7 +72,7 @@ def test_truth_is_optional_and_may_have_other_images(
     (root / "query_gt/sensors/sensors.txt").unlink()
     assert import_kapture_folders(root, tmp_path / "b")["queries_with_truth"] == 0
     assert not (tmp_path / "b" / "query_gt").exists()
-    assert "query: has poses; only those in query_gt/ count as true poses" in caplog.text
+    assert "query: its poses are ignored; true poses belong in query_gt/" in caplog.text
 
 
 @pytest.mark.parametrize("prefix", ["", "q"])
@@ -156,7 +156,7 @@ def test_truth_of_no_query_is_refused(root: Path, tmp_path: Path) -> None:
         (
             ["b/q.jpg", "r.jpg"],
             True,
-            r"query_gt: its 2 .* 'b/q.jpg', are not queries, .* 'b/q.png'",
+            r"query_gt: none of its 2 .* 'b/q.jpg'\) is a query .* 'b/q.png'",
         ),
         (["b/q.png"], False, r"query_gt: no image has a pose: sensors/trajectories.txt is missing"),
     ):
@@ -204,7 +204,7 @@ def dataset(tmp_path: Path) -> OfficialDataset:
     [
         ({"mapping": one_camera(["db/1.jpg"])}, "no mapping image with a pose is left"),
         ({"query": KaptureData()}, "no query image is left"),
-        ({"query": one_camera(["db/2.jpg"])}, "image 'db/2.jpg' is in the map and a query"),
+        ({"query": one_camera(["db/2.jpg"])}, "'db/2.jpg' is both a map image and a query"),
     ],
 )
 def test_a_dataset_without_map_or_queries_or_with_shared_images_is_refused(

@@ -122,7 +122,7 @@ class Layout:
         return wanted
 
     def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
-        """Read the existing images, and count v1.1's queries omitted from v1.0."""
+        """Read the existing images, and count the queries of v1.1 that are omitted for v1.0."""
         images = AachenImages(version)
         if version == "1.1":
             model = read_colmap_model(self.colmap_model, with_points=False)
@@ -162,7 +162,7 @@ class Layout:
     def _centred(self, nvm: NvmModel, position: int) -> Camera:
         """Return the NVM's camera with a centred principal point.
 
-        No published camera is known to differ from it.
+        As far as known, all published cameras are centred.
         """
         name = nvm.names[position]
         width, height = image_size(self.images / name)
@@ -192,7 +192,7 @@ def _first(folders: Iterable[Path]) -> Path:
 def from_kapture(
     form: KaptureForm, wanted: Wanted, missing: Missing
 ) -> tuple[AachenImages, dict[str, Path]]:
-    """Return the images of kapture folders, numbered as official ones, and the file of each."""
+    """Return the images of kapture folders, numbered like official ones, and their files."""
     kapture_images = form.read(missing)
     images = AachenImages(_version_of(form, wanted, kapture_images))
     cameras: dict[str, int] = {}
@@ -211,7 +211,7 @@ def from_kapture(
         require(
             not image.is_query or image.name in images.conditions,
             f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name; `megloc eval "
-            "kapture` is for other datasets than Aachen",
+            "kapture` is for datasets other than Aachen",
             path=form.root,
         )
     return images, {image.name: image.file for image in kapture_images}
@@ -239,7 +239,8 @@ class AachenOptions(Options):
 
     version: Wanted = Field(
         default="auto",
-        description="version; auto: 1.1 if its model or, in kapture folders, its images exist",
+        description="version; auto: 1.1 if its model exists or, for kapture folders, if their "
+        "images or folder names show it, else 1.0",
     )
     reference_model: bool = Field(
         default=False, description="import the SIFT model too, as a kapture map in reference/"
@@ -323,7 +324,7 @@ class Aachen:
         remarks: list[str],
         **more: Any,
     ) -> OfficialDataset:
-        truth, _ = read_ground_truth(missing.root, images.query, World())  # names have conditions
+        truth, _ = read_ground_truth(missing.root, images.query, World())  # groups are known
         conditions = images.conditions.items()
         return OfficialDataset(
             mapping=images.mapping,

@@ -4,8 +4,8 @@ A challenge's relocalization files lie in the root, in one of its folders, or in
 ``RelocalizationFiles*`` below either. They select the recordings and the queries, and assign a
 nearby keyframe to each query. Poses are in the reference recording's scene (east-north-up), with an
 origin near its keyframes.
-``ECEF_from_cam = e_from_gpsw * inv(w_from_gpsw) * s_from_as * scale * slam_from_cam``, with the
-names of Transformations.txt (s = w) and the scale of the pose's row or, failing that, that file.
+``ECEF_from_cam = e_from_gpsw * inv(w_from_gpsw) * s_from_as * scale * slam_from_cam``, in the
+notation of Transformations.txt (s = w); ``scale`` is in the pose's row or else in that file.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ class FourSeasons:
     card = DatasetCard(
         title="4Seasons",
         published_at="https://www.4seasons-dataset.com",
-        size="several GB per recording: its undistorted stereo images and reference poses, and "
-        "calibration.zip once",
+        size="several GB per recording (undistorted stereo images and reference poses), plus "
+        "one calibration.zip",
         folders=("4Seasons",),
         layout="ROOT/calibration/ and ROOT/<recording>/{undistorted_images/,GNSSPoses.txt,"
         "Transformations.txt} of two recordings or more; relocalization files of a "
@@ -252,7 +252,7 @@ def _image_groups(
 ) -> dict[str, ImageGroup]:
     """Return image groups; the condition of a query is its recording.
 
-    Only left images are scored; of a recording with relocalization files, only those in the files.
+    Only left images are scored; if a recording has relocalization files, only those listed there.
     """
     groups = {
         image: ImageGroup(location=image.partition("/")[0]) for image in mapping.image_names()
@@ -312,13 +312,13 @@ def _remarks(
             )
     if frame.earth_from_scene is None:
         remarks.append(
-            f"The map's poses are those of {POSES}, in a separate frame: only the query poses in "
-            "relocalization files are known."
+            f"The map's poses are those of {POSES}, whose frame no other recording shares: "
+            "only the query poses in relocalization files are known."
         )
     if lost:
         remarks.append(
             f"{lost} pairs of relocalization files are left out: their reference has no "
-            "pose or image, or their query no image. A challenge expects every pair."
+            "pose or image, or their query has no image. A challenge expects every pair."
         )
     return remarks
 
@@ -430,7 +430,7 @@ class LocalFrame:
 def read_keyframe_poses(
     recording: Recording, min_fusion_quality: int, missing: Missing, *, on_earth: bool = True
 ) -> KeyframePoses | None:
-    """Return the published keyframe poses, or None; ``on_earth`` rules out ``poses.txt``."""
+    """Return the published keyframe poses or None; ``on_earth`` excludes those of ``poses.txt``."""
     plain = recording.folder / POSES
     if not on_earth and plain.is_file():
         poses = read_poses(plain)

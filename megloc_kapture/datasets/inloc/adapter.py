@@ -47,12 +47,12 @@ LAYOUT = (
     "database/alignments/DUC1/transformations/DUC_trans_000.txt, query/iphone7/IMG_0000.JPG"
 )
 
-# folder names in archives and redistributions, most official first
+# folder names in archives and redistributions, official ones first
 _ROOTS = ("", "dataset", "InLoc")
 _CUTOUTS = ("database/cutouts", "cutouts", "database/cutouts_imageonly", "cutouts_imageonly")
 _ALIGNMENTS = ("database/alignments", "alignments")
 _QUERIES = ("query/iphone7", "queries/iphone7", "iphone7")
-# the file name in the published archive lacks the "n", that in the documentation has it
+# the name in the published archive, which lacks an "n", and in the documentation
 _WRONG_SCANS = ("know_incorrect.txt", "known_incorrect.txt")
 _SCAN = re.compile(r"[0-9]{3}")
 _PHOTOGRAPH = (".jpg", ".jpeg")
@@ -64,7 +64,7 @@ _SCAN_NUMBER = re.compile(r"(?<![0-9])[0-9]{1,3}(?![0-9])")
 
 @dataclass(frozen=True, slots=True)
 class Cutout:
-    """A cutout as described by its name; yaw is counted from the scan's -x axis, to the right."""
+    """A cutout as described by its name; yaw is measured from the scan's -x axis to the right."""
 
     building: str
     scan: str
@@ -119,7 +119,7 @@ def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.
         try:
             points = np.asarray(loadmat(path, variable_names=[POINTS])[POINTS], np.float64)
         except NotImplementedError as error:
-            reason = "a MAT file of version 7.3, which scipy cannot read; in MATLAB save it by -v7"
+            reason = "scipy cannot read MAT files of version 7.3; in MATLAB, save it with -v7"
             raise DataError(reason, path=path) from error
     if points.shape != (height, width, 3):
         shape = "x".join(map(str, points.shape))
@@ -250,7 +250,7 @@ class InLocOptions(Options):
     """The part of InLoc to import."""
 
     distractor_floors: bool = Field(
-        default=False, description="also import CSE3, CSE4 and CSE5, without queries"
+        default=False, description="also import CSE3, CSE4 and CSE5, which have no queries"
     )
     depth: bool = Field(default=True, description="import the scanned points as depth maps")
     depth_step: int = Field(
@@ -301,8 +301,8 @@ class InLoc:
                     map_.add(scan, missing)
         require(
             not self.options.depth or not map_.groups or map_.depth or missing.allowed,
-            f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
-            "them is imported with the option depth = false",
+            f"no cutout has a file of points (.jpg{POINTS_SUFFIX}); to import without "
+            "points, set the option depth = false",
             path=layout.cutouts,
         )
         names = [f"{QUERIES}/{name}" for name in layout.queries(missing)]
@@ -319,7 +319,9 @@ class InLoc:
             names={image: last_part(image) for image in names},
             protocol=protocol_of(self.name),
             summary=self._summary(map_, groups),
-            remarks=[f"Omitted, wrongly placed: scans {', '.join(left_out)}."] if left_out else [],
+            remarks=[f"Omitted as wrongly placed: scans {', '.join(left_out)}."]
+            if left_out
+            else [],
             missing=missing,
             write_more=lambda output: map_.write_depth_maps(output / records),
         )
@@ -428,7 +430,7 @@ def _queries(names: list[str], folder: Path) -> KaptureData:
 
 
 def depth_camera(camera: Camera, step: int) -> Camera:
-    """Return the camera of an image of every ``step``-th row and column.
+    """Return the camera of an image with only every ``step``-th row and column.
 
     The rays through the centres of these pixels stay the same.
     """

@@ -101,7 +101,7 @@ def _read_list(
             if image is None or (conditions and not image.condition):
                 raise DataError(f"expected {form}, got {fields[0]!r}")
             values[image] = parse(fields)
-    require(values, "no image in the list", path=path)
+    require(values, "the list has no images", path=path)
     return values
 
 
@@ -154,7 +154,7 @@ class Layout:
     def check_points(self, model: ModelChoice) -> None:
         """Raise DataError if a file of the model with its points is missing."""
         if self.is_merged(model):
-            remedy = "missing; the reference model is read from it"
+            remedy = "file is missing; the reference model is read from it"
             require(self.merged_model.is_file(), remedy, path=self.merged_model)
         else:
             for folder in self.individual_models().values():
@@ -190,7 +190,7 @@ def read_reference(
 ) -> tuple[dict[ImageKey, RigidTransform], dict[ImageKey, str]]:
     """Read ``cam_from_world`` of the reference images, in model order, and known locations.
 
-    The individual models share a world frame; an image of several models belongs to the first.
+    The individual models share a world frame; an image in several models is read from the first.
     """
     individual = layout.individual_models()
     locations: dict[ImageKey, str] = {}
@@ -237,7 +237,7 @@ def _keys(names: Sequence[str], path: Path) -> list[ImageKey]:
         if image is None or not image.condition or image.camera not in CAMERAS:
             known = ", ".join(CAMERAS)
             raise DataError(
-                f"image {name!r}; expected condition/camera/time.png, camera one of {known}",
+                f"image {name!r} is not named condition/camera/time.png, camera one of {known}",
                 path=path,
             )
         if keys.setdefault(image, name) != name:
@@ -289,7 +289,7 @@ def known_queries(
     at_time: Mapping[tuple[str, int], ImageKey],
     missing: Missing,
 ) -> tuple[dict[ImageKey, Value], int]:
-    """Return the entries of a list of version 2 by query, and the number of entries without one.
+    """Return the entries of a version 2 list by query, and the number of those without a query.
 
     ``at_time`` are the queries of ``queries_per_location`` by camera and time.
     """
@@ -298,7 +298,7 @@ def known_queries(
         query = at_time.get((image.camera, image.timestamp))
         if query is not None and image.condition in ("", query.condition):
             values[query] = value
-        elif missing.allowed or not at_time:  # without queries_per_location, its files are missing
+        elif missing.allowed or not at_time:  # missing lists are reported elsewhere
             unlisted += 1
         else:
             raise DataError(

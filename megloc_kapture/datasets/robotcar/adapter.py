@@ -71,7 +71,7 @@ _QUERIES_PER_CAMERA = {
 
 
 class RobotCarOptions(Options):
-    """The part of RobotCar Seasons to import, and the published model of its poses."""
+    """The part of RobotCar Seasons to import, and the published model that provides its poses."""
 
     version: Literal["auto", 1, 2] = Field(
         default="auto",
@@ -83,7 +83,7 @@ class RobotCarOptions(Options):
     )
     queries: Literal["all", "train", "test"] = Field(
         default="all",
-        description="version 2: import only the queries taken at the moments of this list",
+        description="version 2: import only queries taken at the times of the images in this list",
     )
     train_as_map: bool = Field(
         default=False,
@@ -143,7 +143,7 @@ class RobotCar:
             found = next(find_near(layout.root, layout.test_list.name), None)
             require(
                 found in (None, layout.test_list),
-                "a list of version 2, which belongs in the root; version=1 imports version 1",
+                "this list of version 2 belongs in the root; to import version 1, set version=1",
                 path=found,
             )
             version = 1 if found is None else 2
@@ -218,7 +218,7 @@ class RobotCar:
     ) -> OfficialDataset:
         car = with_rig_of_model(car, selection.map_poses)
         mapping, query = mapping_data(selection, car), with_images(car, selection.query_images)
-        published, _ = read_ground_truth(missing.root, query, World())  # names have conditions
+        published, _ = read_ground_truth(missing.root, query, World())  # groups are known
         groups = _image_groups(selection)
         others = "test images" if selection.version == 2 else "other queries"
         truth = (
@@ -271,7 +271,7 @@ def _image_groups(selection: Selection) -> dict[str, ImageGroup]:
 def _query_priors(
     selection: Selection, groups: Mapping[str, ImageGroup]
 ) -> dict[str, tuple[str, ...]]:
-    """Return the permitted locations of each query: its own and unknown ones, of its camera.
+    """Return each query's permitted locations: its own, and its camera's images without one.
 
     A query without permitted map images keeps its locations as a prior, so that it is matched with
     no map image at all.
@@ -329,8 +329,9 @@ def _remarks(selection: Selection) -> list[str]:
     if unknown:
         folder = Layout(Path()).individual_model("NNN")
         remarks.append(
-            f"The location of {unknown} map images is not known: only the individual models have "
-            f"it ({folder}, extracted). All queries of their camera may be matched with them."
+            f"The location of {unknown} map images is not known, because only the individual "
+            f"models have it (extract {folder}). All queries of their camera may be matched with "
+            "them."
         )
     if selection.queries.unlisted:
         remarks.append(

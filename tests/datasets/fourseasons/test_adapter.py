@@ -209,7 +209,7 @@ def test_pairs_of_2020_have_poses_relative_to_poses_txt(root: Path) -> None:
     # x_query = R (x_world - (100.5, 7, 3)) + (1, 2, 3)
     at = np.array([[101.0, 8.0, 5.0]])
     np.testing.assert_allclose(known.apply(at)[0], turn @ [0.5, 1, 2] + [1, 2, 3], atol=1e-12)
-    assert "poses.txt, in a separate frame" in dataset.remarks[0]
+    assert "poses.txt, whose frame no other recording shares" in dataset.remarks[0]
 
 
 def test_the_pose_of_a_pair_takes_precedence_over_that_of_the_recording(root: Path) -> None:

@@ -147,14 +147,14 @@ def test_layouts_of_redistributions_are_accepted(
 def test_points_of_matlab_7_3_are_refused_with_the_remedy(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg.mat"
     path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(384))
-    with pytest.raises(DataError, match="version 7.3, .* save it by -v7"):
+    with pytest.raises(DataError, match="version 7.3; .* save it with -v7"):
         read_cutout_points(path, 2, 2)
 
 
 def test_a_download_without_points_is_imported_without_depth(root: Path, tmp_path: Path) -> None:
     for path in root.rglob("*.mat"):
         path.unlink()
-    with pytest.raises(DataError, match="without them is imported with the option depth = false"):
+    with pytest.raises(DataError, match="to import without points, set the option depth = false"):
         read(root)
     output = imported(root, tmp_path / "out", depth=False)
     assert len(KaptureFolder(output / "mapping").read().poses()) == 72

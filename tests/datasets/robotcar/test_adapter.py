@@ -77,7 +77,9 @@ def test_version_1_asks_for_all_rear_images(downloaded: Path) -> None:
 def test_the_test_list_decides_the_version(root: Path) -> None:
     (root / "lists").mkdir()
     (root / "robotcar_v2_test.txt").rename(root / "lists/robotcar_v2_test.txt")
-    with pytest.raises(DataError, match=r"lists/robotcar_v2_test\.txt: a list of version 2, which"):
+    with pytest.raises(
+        DataError, match=r"lists/robotcar_v2_test\.txt: this list of version 2 belongs"
+    ):
         read(root)
     assert list(read(root, version=1).names.values())[0].endswith(".jpg")
     (root / "lists/robotcar_v2_test.txt").unlink()
