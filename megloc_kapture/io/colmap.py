@@ -26,7 +26,7 @@ from megloc_kapture.errors import DataError, OutputError, require
 from megloc_kapture.io.files import TEMPORARY, output_error
 from megloc_kapture.values import Camera, Options, RigidTransform
 
-# minimum number of residuals for several threads, so high that COLMAP always uses a single thread
+# minimum number of residuals for multithreading, so high that COLMAP always uses a single thread
 NEVER = 2**31 - 1
 
 
@@ -106,7 +106,7 @@ def undistorted_pinhole(camera: Camera) -> Camera:
 
 
 def focal_from_exif(jpeg: bytes) -> float | None:
-    """Return COLMAP's focal length in pixels from the EXIF of a JPEG file, or None."""
+    """Return the focal length in pixels that COLMAP infers from a JPEG file's EXIF, or None."""
     pycolmap = load_pycolmap()
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         path = Path(folder) / "blank.jpg"
@@ -143,13 +143,13 @@ def focal_from_matches(
 # ------------------------------------------------------------------------------- triangulation
 
 
-# relative decrease of the cost that ends an adjustment; with COLMAP's 0, triangulation takes 1.4
-# times as long on redkitchen_rgbd, and 99 % of the points differ by at most 1 mm
+# bundle adjustment ends if the cost decreases by a smaller fraction; with COLMAP's 0, triangulation
+# takes 1.4 times as long on redkitchen_rgbd, and 99 % of the points differ by at most 1 mm
 _FUNCTION_TOLERANCE = 1e-4
 
 
 class TriangulationOptions(Options):
-    """Options of COLMAP's triangulation with known poses."""
+    """Options for COLMAP's triangulation with known poses."""
 
     two_view_tracks: bool = Field(
         default=False, description="keep points that only two images observe"
@@ -179,7 +179,7 @@ def triangulate(
     Return points (N, 3) in the world frame, their mean reprojection errors in pixels (N,), and
     their observations (O, 3): rows of a point, an image and a keypoint of this image, sorted.
 
-    ``matches`` are (M, 2) keypoint rows of pairs (i, j) of images. The world is centred on the
+    ``matches`` maps pairs (i, j) of images to keypoint rows (M, 2). The world is centred on the
     cameras while COLMAP works, so that maps far from the origin (ECEF) lose no digits.
     """
     options = options or TriangulationOptions()
@@ -238,7 +238,8 @@ def database_folder(
             free = disk_usage(folder).free
             if free < needed:
                 raise OutputError(
-                    f"{place}: {free >> 20} MB are free, COLMAP's database needs {needed >> 20} MB"
+                    f"{place}: {free >> 20} MB are free, but COLMAP's database needs "
+                    f"{needed >> 20} MB"
                 )
             yield folder
     except OSError as error:
@@ -271,9 +272,9 @@ def write_database(
 ) -> None:
     """Write a COLMAP database in which every camera is its own rig.
 
-    ``images`` are name, camera id and keypoints (N, 2); their ids count from 1. ``matches`` are
-    (M, 2) keypoint rows of pairs (i, j) of rows of ``images``. They are stored as inliers, unless
-    ``geometry`` verifies them.
+    ``images`` are name, camera id and keypoints (N, 2); their ids count from 1. ``matches`` maps
+    pairs (i, j) of indices into ``images`` to keypoint rows (M, 2), which are stored as inliers
+    unless ``geometry`` verifies them.
     """
     pycolmap = load_pycolmap()
     database = pycolmap.Database.open(str(path))
@@ -353,8 +354,8 @@ def write_model(
     """Write a binary COLMAP model in which every camera is its own rig; ids count from 1.
 
     ``observed`` holds, for each image, the rows of its keypoints and of the points they observe.
-    Unobserved points are written too. Of several points that a keypoint observes, which kapture
-    permits, only the first is kept for it.
+    Unobserved points are written too. If a keypoint observes several points, as kapture
+    permits, only the first is kept.
     """
     pycolmap = load_pycolmap()
     model = _posed_reconstruction(images, *_cameras_of(images))

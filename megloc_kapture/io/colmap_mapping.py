@@ -1,4 +1,4 @@
-"""SIFT, structure from motion and dense stereo of COLMAP, through pycolmap.
+"""COLMAP's SIFT, structure from motion and dense stereo, through pycolmap.
 
 The mappers are COLMAP's incremental one (Schoenberger and Frahm, CVPR 2016) and GLOMAP (Pan et al.,
 ECCV 2024). A stereo workspace holds undistorted ``images/NAME``, a model with PINHOLE cameras in
@@ -42,7 +42,7 @@ MIN_IMAGES = 3
 # points that two images must share to be connected, and that a model must have: fewer may be chance
 # inliers of RANSAC, and COLMAP needs as many inliers to register an image
 _MIN_POINTS = 30
-# a photograph was taken with another zoom, or is a crop, if its separately estimated focal length
+# a photograph was taken at a different zoom, or is a crop, if its separately estimated focal length
 # differs from the median by more than _OTHER_ZOOM (difference of logarithms) and its reprojection
 # error falls below _SMALLER_ERROR times that with the shared camera
 _OTHER_ZOOM, _SMALLER_ERROR = 0.08, 0.95
@@ -123,8 +123,8 @@ def reconstruct(
 ) -> list[Model]:
     """Estimate poses and cameras from matches; return connected models, the largest first.
 
-    ``matches`` are (M, 2) keypoint rows of pairs (i, j) of photographs. Two images are connected if
-    they share at least 30 points. Doubtful images with another focal length get new cameras,
+    ``matches`` maps pairs (i, j) of photographs to keypoint rows (M, 2). Two images are connected
+    if they share at least 30 points. Doubtful images with a different focal length get new cameras,
     and the reconstruction is repeated. COLMAP runs in one thread to be deterministic.
     """
     pycolmap = load_pycolmap()
@@ -208,7 +208,7 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
 
 
 def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, str]:
-    """Map doubtful images with another focal length to the first image of their group.
+    """Map doubtful images with a different focal length to the first image of their group.
 
     Poses and points absorb the error of a shared camera; bundle adjustment with a separate camera
     per image reveals it.
@@ -274,7 +274,7 @@ def _errors_px(reconstruction: Any) -> dict[int, float]:
 def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]:
     """Split a reconstruction into models whose images are connected by 30 or more shared points.
 
-    The mappers accept the few wrong matches that join unrelated parts. ``sensors`` are in the order
+    The mappers join unrelated parts even by a few wrong matches. ``sensors`` are in the order
     of the camera ids of the pycolmap.Reconstruction.
     """
     reconstruction.update_point_3d_errors()  # the global mapper stores errors of rays, not pixels

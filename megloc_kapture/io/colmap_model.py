@@ -77,7 +77,7 @@ class SparsePoints:
     def of_rows(
         cls, heads: NDArray[Any], lengths: NDArray[Any], observations: NDArray[Any]
     ) -> SparsePoints:
-        """Build points from heads (X Y Z R G B), track lengths and rows image, feature, x, y."""
+        """Build points from heads (X Y Z R G B), track lengths and rows of image, feature, x, y."""
         return cls(
             heads[:, :3].copy(),
             heads[:, 3:].astype(np.uint8),
@@ -111,9 +111,9 @@ class ColmapImage:
 class ColmapModel:
     """One reconstruction, with images sorted by id.
 
-    ``points.image_ids`` are positions in ``images``, not COLMAP's ids. ``cams_from_rig`` is by rig
-    id, then camera id; ``frames`` maps image ids to frame ids. A frame is the images of a rig at
-    one time.
+    ``points.image_ids`` are positions in ``images``, not COLMAP's ids. The keys of
+    ``cams_from_rig`` are rig ids, then camera ids; ``frames`` maps image ids to frame ids. A frame
+    is the set of images that a rig takes at one time.
     """
 
     cameras: dict[int, Camera]
@@ -134,7 +134,7 @@ def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path,
     paths = [folder / name for name in (names if with_points else names[:2])]
     for path in paths:
         reason = "; the points are read from it" if path.stem == "points3D" else ""
-        remedy = " (an empty file: a model of poses only)" if path.name == "points3D.txt" else ""
+        remedy = " (add an empty one if it has no points)" if path.name == "points3D.txt" else ""
         require(path.is_file(), f"file is missing{reason}{remedy}", path=path)
     more = [folder / f"{name}{paths[0].suffix}" for name in _RIG_FILES]
     return (*paths, *(path for path in more if path.exists()))
@@ -143,7 +143,7 @@ def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path,
 def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     """Read the model of a folder; without points, their file need not exist.
 
-    Points whose tracks name images or features that the model lacks are ignored, with a warning.
+    If tracks name images or features that the model lacks, all points are ignored with a warning.
     """
     paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
@@ -220,7 +220,7 @@ def _is_image(line: str) -> bool:
 def _images_for_pycolmap(path: Path, cameras: Path) -> tuple[str, dict[int, str]]:
     """Check ``images.txt``; return it with ids in place of names, and the names by id.
 
-    pycolmap ends names at a blank, and after a missing line of features takes an image for one.
+    pycolmap ends names at a blank and takes the next image for a missing line of features.
     """
     cameras_text = read_text(cameras).split("\n")
     camera_ids = {line.split(maxsplit=1)[0] for line in cameras_text if line.strip()}

@@ -50,7 +50,7 @@ RELOCALIZATION_FILE = "relocalization.csv"
 UNREADABLE_FILE = "unreadable.csv"
 UNREGISTERED_FILE = "unregistered.csv"
 NOWHERE_FILE = "nowhere.txt"
-# units of the local frame; NO_METRES is that of a map of unknown scale
+# units of the local frame; NO_METRES is used for maps of unknown scale
 METRES, NO_METRES = "m", "units"
 
 PoseFileNames = Literal["full", "basename"]
@@ -60,7 +60,7 @@ PoseFileFormat = Literal["ltvl", "mlad"]
 class ImageGroup(Options):
     """Condition in reports (``day``, ``night-rain``), coordinate frame and location of one image.
 
-    Queries that are not ``scored`` are missing from the pose file and from the recall.
+    Queries that are not ``scored`` are omitted from the pose file and from the recall.
     """
 
     condition: str = ""
@@ -202,7 +202,7 @@ class SideTables:
     world: World = World()
 
     def scored(self, images: Iterable[str]) -> set[str]:
-        """Return the images that count in recall and belong in the pose file."""
+        """Return the images that count towards recall and belong in the pose file."""
         return {i for i in images if i not in self.groups or self.groups[i].scored}
 
     def conditions(self, images: Iterable[str]) -> dict[str, str]:
@@ -260,12 +260,12 @@ NO_TABLES = SideTables()
 
 
 def check_tables(folder: Path | str) -> None:
-    """Raise DataError unless the folder, which a user named, has tables."""
+    """Raise DataError unless the folder, which the user gave, has tables."""
     place = Path(folder)
     require(place.is_dir(), "no such folder", path=place)
     require(
         any((place / name).is_file() for name in (PROTOCOL_FILE, GROUPS_FILE)),
-        f"neither {PROTOCOL_FILE} nor {GROUPS_FILE}; give the folder {SIDE_TABLES}/",
+        f"found neither {PROTOCOL_FILE} nor {GROUPS_FILE}; give the folder {SIDE_TABLES}/",
         path=place,
     )
 
@@ -319,7 +319,7 @@ def write_unreadable(
 
 
 def tables_of(root: Path | str) -> Path | None:
-    """Return the ``megloc/`` folder in a kapture folder or its parent; None if both lack it."""
+    """Return the ``megloc/`` folder in a kapture folder or its parent; None if neither has it."""
     root = Path(root)
     for folder in (root, root.resolve().parent):
         if (folder / SIDE_TABLES / PROTOCOL_FILE).is_file():
@@ -328,7 +328,7 @@ def tables_of(root: Path | str) -> Path | None:
 
 
 def read_tables_of(root: Path | str) -> SideTables:
-    """Read the tables in a kapture folder or its parent; no table has rows if both lack them."""
+    """Read the tables in a kapture folder or its parent; empty tables if neither has any."""
     tables = tables_of(root)
     return NO_TABLES if tables is None else read_side_tables(tables)
 

@@ -126,7 +126,7 @@ def check_component(text: str) -> str:
     """Return ``text`` if it is a valid type name: a single folder name and a single CSV field."""
     check_relative(text)
     if "/" in text or "," in text or text != text.strip():
-        raise DataError(f"{text!r} cannot be a type name (slash, comma, or space at an end)")
+        raise DataError(f"{text!r} cannot be a type name (slash, comma, leading or trailing space)")
     return text
 
 
@@ -147,7 +147,7 @@ def temporary_name() -> str:
 
 
 def clear_temporary(folder: Path, *, nested: bool = True) -> None:
-    """Remove unfinished files in a folder without another writer; if ``nested``, also below it."""
+    """Remove unfinished files in a folder that nobody writes to and, if ``nested``, below it."""
     find = folder.rglob if nested else folder.glob
     for path in list(find(f"{TEMPORARY}*")):
         remove(path)
@@ -219,7 +219,7 @@ def user_cache() -> Path:
 
 
 def find_near(root: Path, pattern: str) -> Iterator[Path]:
-    """Find files and folders in ``root`` and three levels of folders; ``root`` may be a disk."""
+    """Find paths in ``root`` and in folders up to three levels below; ``root`` may be a disk."""
     for depth in range(4):
         yield from root.glob(f"{'*/' * depth}{pattern}")
 

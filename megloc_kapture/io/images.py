@@ -40,7 +40,7 @@ UNREAD_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", 
 EXIF_DEVIATION, GUESS_DEVIATION = 0.1, 0.7
 # COLMAP's guess of the focal length, as a multiple of the larger side of the image
 _GUESS = 1.2
-# a longer focal length, as a multiple of the larger side, is no measurement (EXIF: 65535 mm)
+# a focal length above this multiple of the larger side is not a measurement (EXIF: 65535 mm)
 _LONGEST = 100
 _ORIENTATION, _MAKE, _MODEL, _EXIF, _GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
 # focal length in mm and 35 mm equivalent, focal plane resolution (x, y) and unit, image size
@@ -76,7 +76,7 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
 
 
 def _decoded_by_opencv(content: bytes) -> NDArray[Any] | None:
-    import cv2  # 0.1 s, and most commands that import io never read an image
+    import cv2  # takes 0.1 s, and most commands that import io never read an image
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # callers report errors
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -187,7 +187,7 @@ def check_image_file(path: Path) -> None:
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:
-    """Raise DataError for a truncated file, which OpenCV fills with grey; libpng prints errors."""
+    """Raise DataError if truncated: OpenCV fills such files with grey, and libpng prints errors."""
     if content.startswith(b"\xff\xd8"):
         # end-of-image marker after the last start-of-scan: entropy-coded data contains neither, and
         # the markers of a thumbnail come first
@@ -321,7 +321,7 @@ def photo_of(image: Image.Image) -> Photo:
 def _tried(read: Callable[[], T]) -> T | None:
     try:
         return read()
-    except Exception:  # pillow raises many kinds of errors; damaged EXIF fields count as missing
+    except Exception:  # pillow raises many kinds; damaged EXIF fields are treated as missing
         return None
 
 

@@ -252,7 +252,7 @@ class DepthRow:
 
     ``sources`` are the images that the map image was compared with, best first; ``near_m`` and
     ``far_m`` limit the depths that were tried. ``fill`` is the fraction of pixels with depth.
-    ``reason`` says why there is no depth, if so.
+    ``reason`` says why there is no depth; it is empty if there is.
     """
 
     image: str

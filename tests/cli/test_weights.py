@@ -168,7 +168,7 @@ def test_a_different_file_is_replaced_only_by_force(megloc: Any, folder: Path) -
 
 def test_wrong_and_missing_downloads_are_refused(megloc: Any, served: Path) -> None:
     (served / "unknown.pth").write_bytes(b"something else")
-    megloc("weights", "fetch", "unknown", "-q").refused("not weights of torch")
+    megloc("weights", "fetch", "unknown", "-q").refused("not weights that torch")
     (served / "free.pth").write_bytes(BOUND)
     megloc("weights", "fetch", "free", "-q").refused("expected sha256:.* but got")
     (served / "free.pth").unlink()

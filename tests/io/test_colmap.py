@@ -222,6 +222,6 @@ def test_a_disk_without_room_for_the_database_is_refused(
     _, images, _ = scene(PINHOLE)
     full = shutil.disk_usage(tmp_path)._replace(free=1 << 19)
     monkeypatch.setattr("megloc_kapture.io.colmap.disk_usage", lambda path: full)
-    with pytest.raises(OutputError, match="0 MB are free, COLMAP's database needs 1 MB"):
+    with pytest.raises(OutputError, match="0 MB are free, but COLMAP's database needs 1 MB"):
         triangulate(images, {}, scratch=tmp_path / "map")
     assert list((tmp_path / "map").iterdir()) == []

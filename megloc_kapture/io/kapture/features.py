@@ -1,7 +1,7 @@
 """Keypoints, descriptors and global features of images, and the files that hold them.
 
-Features, one binary array per image, are stored inside a kapture (``reconstruction/<kind>/T/``) or
-in kapture-localization's orphan layout (``local_features/T/<kind>/``,
+Features, one binary array per image, are stored in a kapture folder (``reconstruction/<kind>/T/``)
+or in kapture-localization's orphan layout (``local_features/T/<kind>/``,
 ``global_features/T/global_features/``), as files or as a single tar. The folder name ``T`` is the
 type name; ``name`` in the configuration file is not used. Arrays are raw, little-endian, row-major,
 without a header.
@@ -59,7 +59,7 @@ _ROUNDING = 4e-7  # rows whose squared length differs from 1 by at most this sta
 class FeatureConfig:
     """The only row of a ``keypoints.txt``, ``descriptors.txt`` or ``global_features.txt``.
 
-    ``dsize`` counts numbers per row; ``metric_type`` is the distance, e.g. ``"L2"``.
+    ``dsize`` is the number of values per row; ``metric_type`` is the distance, e.g. ``"L2"``.
     """
 
     name: str
@@ -70,7 +70,7 @@ class FeatureConfig:
 
     def __post_init__(self) -> None:
         dtype = np.dtype(self.dtype).newbyteorder("<")
-        require(dtype in DTYPES.values(), f"dtype {dtype.name!r} is not of {', '.join(DTYPES)}")
+        require(dtype in DTYPES.values(), f"dtype {dtype.name!r} is not one of {', '.join(DTYPES)}")
         object.__setattr__(self, "dtype", dtype)
 
 
@@ -105,7 +105,7 @@ def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
         message = "upgrade features of kapture 1.0 with kapture_upgrade_1_0_to_1_1"
         if orphan:
             message = f"give the folder that contains {parent.name}/TYPE/{kind}"
-        raise DataError(f"features without the folder of their type: {message}", path=parent)
+        raise DataError(f"the features lack the folder of their type: {message}", path=parent)
     types = []
     with reading(parent):
         names = sorted(entry.name for entry in parent.iterdir() if not entry.name.startswith("."))
@@ -128,7 +128,7 @@ def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
             keypoints_type = check_component(rest[0]) if kind == "descriptors" else None
             metric_type = rest[-1] if rest else None
             return FeatureConfig(name, DTYPES[dtype], int(dsize), keypoints_type, metric_type)
-    raise DataError("no row with the configuration", path=path)
+    raise DataError("the row with the configuration is missing", path=path)
 
 
 def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
@@ -154,7 +154,7 @@ class Blob(NamedTuple):
     def read(self) -> bytes:
         with reading(self.path), open(self.path, "rb", buffering=0) as file:
             content = os.pread(file.fileno(), self.size, self.offset)
-        require(len(content) == self.size, "truncated", path=self.where)
+        require(len(content) == self.size, "the file is truncated", path=self.where)
         return content
 
     @property
@@ -226,8 +226,8 @@ class FeatureReader:
         for path, config in zip(paths[1:], others, strict=True):
             require(
                 (config.dtype, config.dsize) == (self.config.dtype, self.config.dsize),
-                f"{config.dsize} x {config.dtype.name}, but {paths[0]} "
-                f"has {self.config.dsize} x {self.config.dtype.name}",
+                f"rows are {config.dsize} x {config.dtype.name}, but in {paths[0]} "
+                f"they are {self.config.dsize} x {self.config.dtype.name}",
                 path=path,
             )
 
@@ -325,7 +325,7 @@ class FeatureWriter:
         if not path.exists():
             write_bytes(path, content)
         elif format_config(kind, read_config(path, kind)) != content:
-            raise OutputError(f"{path}: has another configuration; remove its folder first")
+            raise OutputError(f"{path}: has a different configuration; remove its folder first")
 
     def __contains__(self, image: str) -> bool:
         return self._path(image).is_file()

@@ -33,7 +33,7 @@ ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_featur
 class KaptureFolder:
     """Lazy, read-only access to a kapture folder and to feature folders in the orphan layout.
 
-    The kapture's own features take precedence. A pickle contains only paths; a process that
+    Features in the kapture folder take precedence. A pickle contains only paths; a process that
     unpickles a folder several times opens it once.
     """
 
@@ -51,7 +51,7 @@ class KaptureFolder:
         return _unpickled, (self.root, self.features_dirs, self._id)
 
     def with_features(self, features_dirs: Sequence[Path | str]) -> KaptureFolder:
-        """Return the same kapture folder with other feature folders."""
+        """Return the same kapture folder with different feature folders."""
         return KaptureFolder(self.root, features_dirs=features_dirs)
 
     def check_features_apart(self, other: KaptureFolder) -> None:
@@ -66,9 +66,9 @@ class KaptureFolder:
                 for image in different:
                     if image in mine and image in theirs and _same_array(mine, theirs, image):
                         raise DataError(
-                            f"{image} is another image in {self.root} than in {other.root}, and "
-                            f"both would get these {kind}; give each its own --features-dir, or "
-                            "another name",
+                            f"{image} is a different image in {self.root} than in {other.root}, "
+                            f"but both would get these {kind}; give each folder a separate "
+                            "--features-dir, or rename one image",
                             path=theirs.where(image),
                         )
 
@@ -174,7 +174,7 @@ class KaptureFolder:
         self, descriptors: FeatureReader, keypoints_by_type: dict[str, FeatureReader]
     ) -> None:
         keypoints_type = cast(str, descriptors.config.keypoints_type)
-        # converters may write the name of another tool here (OpenMVG: SIFT_Regions)
+        # converters may write another tool's name for the type (OpenMVG: SIFT_Regions)
         if keypoints_type not in keypoints_by_type:
             keypoints_type = descriptors.type_name
         keypoints = keypoints_by_type.get(keypoints_type)
@@ -204,7 +204,7 @@ class KaptureFolder:
                 require(
                     column.max() < keypoints.length(image),
                     f"matches of {pair[0]!r} and {pair[1]!r} (type {matches.type_name!r}) "
-                    f"point past the keypoints of {image!r}",
+                    f"refer to keypoints that {image!r} does not have",
                 )
 
     def _check_observations(self, keypoints_type: str, observations: Observations) -> None:

@@ -48,7 +48,7 @@ class MatchesReader:
         for name, path in list_blobs(self._folders, "matches").items():
             parts = name.removesuffix(SUFFIX["matches"]).split(_BETWEEN)
             if len(parts) != 2 or parts[0] == parts[1]:
-                raise DataError("does not name a pair of images", path=path)
+                raise DataError("this is not the name of a pair of images", path=path)
             pairs.add((min(parts), max(parts)))
         return sorted(pairs)
 
@@ -94,7 +94,7 @@ class MatchesWriter:
     def __init__(self, root: Path, type_name: str, *, orphan: bool = False) -> None:
         self._folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
         with writing(self._folder):
-            # kapture finds a type by its folder, so it exists even if no pair is written
+            # kapture finds a type by its folder, so create it even if no pair is written
             self._folder.mkdir(parents=True, exist_ok=True)
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
@@ -115,7 +115,7 @@ def _name(first: str, second: str) -> str:
 
 @dataclass(frozen=True, order=True, slots=True)
 class ImagePair:
-    """Two images to match; a higher score is a better candidate."""
+    """Two images to match; a higher score means a better candidate."""
 
     query: str
     map: str
@@ -125,7 +125,7 @@ class ImagePair:
 def read_pairs(path: Path | str) -> list[ImagePair]:
     """Read a pairs file in its order, without repeated pairs.
 
-    Pairs without a score (in hloc's files, two names separated by a blank) rank in this order.
+    Pairs without a score (hloc: two names separated by a blank) are ranked in the file's order.
     """
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()

@@ -134,7 +134,7 @@ class WeightsFile:
     path: Path
     size: int  # bytes
     mtime_ns: int
-    published: PublishedFile | None = None  # that this must be; None: a user's or converted file
+    published: PublishedFile | None = None  # this must equal it; None: a user's or converted file
 
 
 def weights_folder() -> Path:
@@ -283,7 +283,7 @@ def _load_torch(path: Path, mapped: bool) -> Any:
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     of_scores: list[Any] = [np.dtype, type(np.dtype("f4")), type(np.dtype("f8"))]
     of_scores += [(scalar, name) for name in names]
-    what = "weights of torch or safetensors that hold no code (for others see docs/weights.md)"
+    what = "weights that torch or safetensors reads without running code (see docs/weights.md)"
     with reading(path, what), torch.serialization.safe_globals(of_scores):
         return torch.load(path, weights_only=True, map_location="cpu", mmap=mapped)
 
@@ -300,7 +300,7 @@ def _state_dict(content: Any, path: Path) -> dict[str, torch.Tensor]:
         for key, value in items
         if isinstance(value, torch.Tensor)
     }
-    require(tensors, "holds no named tensors", path=path)
+    require(tensors, "the file has no named tensors", path=path)
     return tensors
 
 
@@ -376,7 +376,7 @@ def add_weights(
 
 
 def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
-    """Convert a checkpoint to safetensors, its sha256 as metadata; return the number of tensors."""
+    """Convert a checkpoint to safetensors, its sha256 in the metadata; return the tensor count."""
     from safetensors.torch import save
 
     check_option(

@@ -177,6 +177,6 @@ def test_features_shared_by_two_images_of_one_name_are_refused(root: Path, tmp_p
     shared = [KaptureFolder(place, features_dirs=[tmp_path / "shared"]) for place in (root, query)]
     shared[0].check_features_apart(shared[1])
     write_image(query / "sensors/records_data/a.jpg", np.full((6, 8, 3), 50, np.uint8))
-    message = r"a\.jpg\.kpt: a\.jpg is another image in .*--features-dir"
+    message = r"a\.jpg\.kpt: a\.jpg is a different image in .*--features-dir"
     with pytest.raises(DataError, match=message):
         shared[0].check_features_apart(shared[1])

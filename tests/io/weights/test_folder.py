@@ -158,7 +158,7 @@ def test_a_broken_download_leaves_no_file(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_code_in_a_checkpoint_is_not_run(code: object, tmp_path: Path) -> None:
     torch.save({"a": torch.ones(1), "optimizer": code}, tmp_path / "x.pth")
-    with pytest.raises(DataError, match=r"x\.pth: not weights of torch .* that hold no code"):
+    with pytest.raises(DataError, match=r"x\.pth: not weights that torch .* without running code"):
         read_weights(find_weights(str(tmp_path / "x.pth")))
     assert not (tmp_path / "made").exists()
 
@@ -196,8 +196,8 @@ def test_broken_missing_and_different_files_are_not_added(folder: Path, tmp_path
     broken.write_bytes(b"<html>sign in</html>")
     for source, unverified, message in (
         (different, False, r"published superpoint_v1\.pth .* instead of 52b67"),
-        (broken, False, "not weights of torch"),
-        (broken, True, "not weights of torch"),
+        (broken, False, "not weights that torch"),
+        (broken, True, "not weights that torch"),
         (tmp_path / "nowhere.pth", False, "the file is missing"),
     ):
         with pytest.raises(DataError, match=message):
