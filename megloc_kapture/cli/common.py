@@ -147,7 +147,7 @@ class Common:
             return kapture_of(path)
         with open_executor("processes") as executor:
             folder = kapture_of(path, work=Work(executor, self.track, force=force))
-        self.say(f"{path}: a COLMAP model, as kapture in {folder}")
+        self.say(f"{path}: a COLMAP model, imported as kapture to {folder}")
         return folder
 
 
@@ -209,9 +209,9 @@ class Reading:
 
     def kapture(self, root: Path) -> KaptureFolder:
         for place in self.features_dir:
-            require(place.is_dir(), "no such folder of features", path=place)
+            require(place.is_dir(), "no such features folder", path=place)
         folder = KaptureFolder(root, features_dirs=self.features_dir)
-        folder.read()  # names a COLMAP model or photographs, before features are missed
+        folder.read()  # rejects a COLMAP model or photographs before missing features are reported
         return folder
 
     def kapture_map(self, root: Path) -> KaptureFolder:
@@ -268,8 +268,8 @@ class Choosing(Computing):
     """Flags that choose options."""
 
     preset: str | None = None
-    """Preset: classic, modern, modern-large, megloc. If omitted, classic; for megloc eval, that of
-    the benchmark file."""
+    """Preset: classic, modern, modern-large, megloc. If omitted, classic; for megloc eval, the
+    benchmark file's."""
     set: Texts = ()
     """Change an option: key.key=value; may be repeated."""
 
@@ -277,7 +277,7 @@ class Choosing(Computing):
         return (*self.set, *super().assignments())
 
     def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
-        """Return the preset's options with changes, those of ``--set`` last."""
+        """Return the preset's options with ``changes`` and then ``--set`` applied."""
         from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 
         preset = self.preset or DEFAULT_PRESET

@@ -70,8 +70,8 @@ class Eval(Localizing, Working):
     fail_below: float | None = None
     """Exit with status 3 if the recall (0 to 1) at the last threshold is lower."""
     force: Overwrite = False
-    """Use a non-empty workspace, or that of another root; accept map poses that contradict the
-    matches of their images."""
+    """Use a non-empty workspace, or one made from another root; accept map poses that contradict
+    the matches of their images."""
 
     def run(self) -> int:
         run = choose_run(
@@ -181,7 +181,7 @@ class Eval(Localizing, Working):
 
 
 def shown(path: Path) -> str:
-    """Return the path relative to the current folder, if it lies below; else unchanged."""
+    """Return the path, relative to the current folder if it lies below it."""
     try:
         return str(path.relative_to(Path.cwd()))
     except ValueError:

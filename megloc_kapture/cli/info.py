@@ -42,7 +42,7 @@ from megloc_kapture.values import Options
 
 _COLUMN = 18
 _QUANTILES = (0.1, 0.5, 0.9)
-# twins have the names of their datasets
+# without twins, which have the same names as their datasets
 _GROUPS = [group for group in PROTOCOLS if group != RENDERED_DATASETS]
 
 
@@ -233,7 +233,7 @@ class OptionsCommand(Common):
 
 
 def shown(value: Any) -> str:
-    """Format a value as ``--set`` takes it; floats have four digits."""
+    """Format a value as ``--set`` takes it; floats have four significant digits."""
     text = _inline(value)
     return text[1:-1] if text.startswith('"') else text
 

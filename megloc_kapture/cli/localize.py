@@ -202,7 +202,7 @@ def _read_token(path: Path) -> str:
     token = read_text(path).strip()
     require(
         len(token) >= _MIN_TOKEN_LENGTH and token.isascii() and token.isprintable(),
-        f"a token is one line of {_MIN_TOKEN_LENGTH} or more printable ASCII characters",
+        f"the token must be one line of {_MIN_TOKEN_LENGTH} or more printable ASCII characters",
         path=path,
     )
     return token

@@ -84,7 +84,7 @@ def command_class(name: str) -> type[Any]:
 
 
 def _parser(given: Sequence[str]) -> Any:
-    """Return the type that tyro parses; only the command in ``given`` has its flags."""
+    """Return the type that tyro parses; only the command that ``given`` names gets its flags."""
     from dataclasses import make_dataclass
 
     import tyro
@@ -136,12 +136,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         import tyro
 
         if isinstance(sys.stdout, TextIOWrapper):
-            # results appear at once, even in a pipe, with names that the terminal cannot print
+            # print results at once, even to a pipe; escape what the terminal cannot print
             sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
         command = tyro.cli(
             _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
         )
-        command = getattr(command, "action", command)  # of `megloc weights`
+        command = getattr(command, "action", command)  # subcommand of `megloc weights`
         debug = command.debug
         command.start_logging()
         status = command.run() or DONE
@@ -172,7 +172,7 @@ def _tell(error: BaseException, debug: bool) -> int:
     elif isinstance(error, OSError) and error.filename is not None:
         lines = [f"{error.filename}: {error.strerror}"]  # unreadable file, or name too long
     elif isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        lines = [f"{error.strerror}: free some in the output's or the temporary folder (TMPDIR)"]
+        lines = [f"{error.strerror}: free some in the output or the temporary folder (TMPDIR)"]
     else:
         raise error
     if debug:

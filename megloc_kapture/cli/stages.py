@@ -120,7 +120,7 @@ class Match(Reading, Choosing, Working):
     input: Input
     """Kapture folder of the map."""
     query: Path | None = None
-    """Kapture folder of the queries; if omitted, the pairs are of map images."""
+    """Kapture folder of the queries; if omitted, both images of a pair are map images."""
     pairs: Path
     """Pairs file."""
     output: Output
@@ -159,9 +159,9 @@ class Match(Reading, Choosing, Working):
         posed = mapping.read().poses().keys()
         unposed = sum(not {pair.query, pair.map} <= posed for pair in pairs)
         message = (
-            f"{unposed} of {len(pairs)} pairs in {self.pairs} have an image without a pose to "
-            f"verify their matches; --query FOLDER (perhaps also {self.input}) verifies them by "
-            "two-view geometry"
+            f"{unposed} of {len(pairs)} pairs in {self.pairs} have an image without a pose and "
+            f"cannot be verified by poses; --query FOLDER (which may be {self.input}) verifies "
+            "them by two-view geometry"
         )
         require(not pairs or unposed < len(pairs), message, path=mapping.root)
         if unposed:
@@ -216,7 +216,7 @@ class ExtractGlobal(Reading, Choosing, Working):
     input: Input
     """Kapture folder of the map; VLAD is trained on its descriptors."""
     query: Folders = ()
-    """Kapture folder of queries, whose images are described too; may be repeated."""
+    """Kapture folder of queries, which also get global features; may be repeated."""
     output: Output
     """Features folder: global_features/T/global_features."""
     features: tuple[str, ...] = ()
@@ -362,8 +362,8 @@ class PairsQuery(Reading, Choosing, Working):
         asked = self.local_features or sorted(both)
         check_option(
             asked,
-            f"{query.root}: no type of local features in common with the map; give their folder "
-            "with --features-dir",
+            f"{query.root}: no type of local features in common with the map; give the folder "
+            "of the features with --features-dir",
         )
         return [only_type(mapping, "descriptors", name) for name in asked]
 
@@ -378,7 +378,7 @@ def _retrieval(
     fusion: FusionMethod | None,
     options: PipelineOptions,
 ) -> Retrieval:
-    """Return the types of global features to compare, and their fusion by the options."""
+    """Return the types of global features to compare, and how to fuse them."""
     types = tuple(only_type(mapping, "global_features", name) for name in asked or (None,))
     how = options.fusion
     if fusion is not None:
@@ -468,7 +468,7 @@ class Preprocess(Computing, Working):
         }
         flags = {"max_size_px": self.resize, "undistort": self.undistort, "masks": masks}
         given = parse_assignments(self.set)
-        given |= given.pop("preprocessing", {})  # as the other stages name these options
+        given |= given.pop("preprocessing", {})  # the prefix of these options elsewhere
         return options_with(PreprocessingOptions, given, flags)
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:

@@ -61,7 +61,7 @@ class Train(Common):
     threads: int = 1
     """Threads that prepare pairs."""
     force: Overwrite = False
-    """Overwrite the files of another training."""
+    """Overwrite the files of another training run."""
 
     def run(self) -> None:
         from megloc_kapture.training.train import TASKS, train  # loads torch
@@ -104,7 +104,7 @@ class TrainField(Common):
     steps: int = 4000
     """Number of training steps."""
     minutes: float | None = None
-    """Stop after this many minutes; results are not reproducible then."""
+    """Stop after this many minutes; the result is then not reproducible."""
     max_side: int = 320
     """Longer side of the training images, px; larger images are reduced."""
     held_out_every: int = 8
@@ -155,7 +155,7 @@ class TrainField(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Working):
-    """Render views of a neural field: at a pose, along a result, or between map cameras."""
+    """Render views of a neural field: at a pose, at a result's poses, or between map cameras."""
 
     allow_links_below: AllowedLinks = ()
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]

@@ -1,4 +1,4 @@
-"""``megloc weights`` and ``doctor``: weights of networks, their licences; environment checks."""
+"""``megloc weights`` and ``doctor``: weights of networks and their licences; environment checks."""
 
 from __future__ import annotations
 

@@ -248,7 +248,7 @@ def test_a_model_is_imported_to_the_cache_where_a_map_is_expected(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     model = colmap_room / "sparse" / "0"
     done = megloc("info", model)
-    assert f"{model}: a COLMAP model, as kapture in {tmp_path}/cache/" in done.err
+    assert f"{model}: a COLMAP model, imported as kapture to {tmp_path}/cache/" in done.err
     assert "7 (7 PINHOLE), 7 with a pose" in done.out and "extracted by plugin sift" in done.out
     assert "unit              units of the map" in done.out
 

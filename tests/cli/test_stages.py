@@ -159,7 +159,7 @@ def test_pairs_of_unknown_images_are_refused(megloc: Any, finished: Path, tmp_pa
     places = ("-i", finished / "mapping", "--features-dir", finished, "-o", tmp_path / "new")
     message = r"pairs\.txt: no image 0001\.jpg in .*/mapping"
     megloc("match", *places, "--pairs", pairs, *INLINE).refused(message)
-    message = "pairs.txt: no such folder of features"
+    message = "pairs.txt: no such features folder"
     megloc("match", *places, "--features-dir", pairs, "--pairs", pairs).refused(message)
     assert not (tmp_path / "new").exists()
 
