@@ -118,8 +118,8 @@ def read_camera(text: str) -> Camera:
 def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> ImageQuery:
     """Read a query from an image file's bytes and a camera as JSON.
 
-    The header is checked before decoding. HTTPException for another format or a broken header
-    (415) or too many pixels (413), DataError for other errors in the image or the camera.
+    The header is checked before decoding. Raise HTTPException for a different format or a broken
+    header (415) or too many pixels (413), and DataError for other errors in image or camera.
     """
     try:
         image = Image.open(BytesIO(content), formats=["JPEG", "PNG"])
@@ -128,7 +128,7 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
             413, f"the image has more than {max_megapixels:g} megapixels"
         ) from error
     except Exception as error:  # pillow raises many kinds of errors for broken headers
-        reason = "the image is neither JPEG nor PNG, or broken"
+        reason = "the image is neither JPEG nor PNG, or is broken"
         if content.startswith((b"/9j/", b"iVBOR", b"data:")):
             reason += "; this is base64: send the bytes of the file"
         raise HTTPException(415, reason) from error
@@ -149,7 +149,7 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
     known = read_camera(camera)
     require(
         (known.width, known.height) == (width, height),
-        f"the image is {width}x{height} as it is stored, its camera says "
+        f"the image is {width}x{height} as stored, but its camera says "
         f"{known.width}x{known.height}",
     )
     return ImageQuery(known, pixels, name)

@@ -160,7 +160,7 @@ def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
     [
         ("{", "camera: Invalid JSON"),
         ({"model": "FISHEYE"}, "unknown camera model 'FISHEYE'; known: "),
-        ({"width": 4000}, "the image is 400x300 as it is stored, its camera says 4000x300"),
+        ({"width": 4000}, "the image is 400x300 as stored, but its camera says 4000x300"),
         ({"path": "/etc/passwd"}, "camera.path: Unexpected keyword argument"),
     ],
 )
