@@ -243,7 +243,7 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
         megloc.map_photographs([np.zeros((8, 8, 3))])  # type: ignore[list-item]
     with pytest.raises(megloc.DataError, match="nowhere"):
         megloc.open_map(tmp_path / "nowhere").localize(scene / "query")
-    with pytest.raises(megloc.DataError, match="features: no such folder of features"):
+    with pytest.raises(megloc.DataError, match="features: no such features folder"):
         megloc.open_map(built.kapture_map.folder.root, features_dirs="features")
     with pytest.raises(megloc.OptionError, match=r"give map=m\.kapture_map for a Map m"):
         megloc.export("ply", tmp_path / "map.ply", map=built)  # type: ignore[arg-type]
@@ -261,7 +261,7 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
 )
 def test_other_things_than_images_are_refused(built: megloc.Map, image: Any) -> None:
     """Such as the None that cv2.imread returns for a missing file."""
-    message = r"an image is a file, uint8 \(H, W, 3\) RGB or a pillow image, got "
+    message = r"an image must be a file, uint8 \(H, W, 3\) RGB or a pillow image, got "
     with pytest.raises(megloc.DataError, match=message):
         built.localize(image)
     with pytest.raises(megloc.DataError, match=message):

@@ -88,7 +88,7 @@ def _client(stack: ExitStack, workers: int, scheduler: str | None) -> Client:
             client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise OptionError(
-                f"there is no dask scheduler at {scheduler}; an address is tcp://HOST:PORT"
+                f"there is no dask scheduler at {scheduler}; give an address tcp://HOST:PORT"
             ) from error
         return stack.enter_context(client)
     folder = stack.enter_context(

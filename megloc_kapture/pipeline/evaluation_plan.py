@@ -155,7 +155,7 @@ def choose_run(
     is_asked = "by" in parse_assignments(assignments).get("mapping_pairs", {})
     others = tuple(method for method in options.mapping_pairs.by if method != "covisibility")
     if options.pairs_by_points() and others and not is_asked and not has_model(source):
-        _log.warning("no reference model in this data: no map pairs by co-visibility")
+        _log.warning("this data has no reference model: map images are not paired by co-visibility")
         pairs = options.mapping_pairs.model_copy(update={"by": others})
         options = options.model_copy(update={"mapping_pairs": pairs})
     return Run(source, preset, options, benchmark, usual)
@@ -183,8 +183,8 @@ def plan_evaluation(run: Run) -> list[Stage]:
         source = with_model(run.source)
         if source is None:
             raise OptionError(
-                f"dataset {run.dataset} comes with no model: mapping_pairs.by covisibility needs "
-                'its points; --set \'mapping_pairs.by=["poses", "retrieval"]\' needs no model'
+                f"dataset {run.dataset} comes with no model, but mapping_pairs.by covisibility "
+                'needs one; --set \'mapping_pairs.by=["poses", "retrieval"]\' needs no model'
             )
         run = replace(run, source=source)
     run.source.check()

@@ -86,8 +86,8 @@ def export_colmap(images: Sequence[ExportedImage], points: Points, output: Path)
     if len(set(names)) != len(names):
         twice = min(name for name in names if names.count(name) > 1)
         raise DataError(
-            f"two images are named {twice!r}, in map and queries, or because / becomes _; COLMAP "
-            "needs unique names"
+            f"two images are named {twice!r}: a map image and a query, or names that differ only "
+            "in / and _; COLMAP needs unique names"
         )
     observed = [(image.rows, image.points) for image in images]
     write_model(output, images, observed, points[:, :3], points[:, 3:])
@@ -130,11 +130,11 @@ def export_nerfstudio(
                 "transform_matrix": (world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
             }
         )
-    # nerfstudio reads the model of all cameras here, and takes frames without it for perspective
+    # nerfstudio reads one model for all cameras here; without it, it assumes perspective cameras
     models = sorted({_nerfstudio_model(image.camera)[0] for image in images})
     require(
         len(models) < 2,
-        f"nerfstudio takes cameras of one model, and these are {' and '.join(models)}: choose one "
+        f"nerfstudio needs cameras of one model, but these are {' and '.join(models)}: choose one "
         f"with --sensor, or undistort: {_UNDISTORT}",
     )
     content: dict[str, Any] = {"camera_model": models[0], "frames": frames}
@@ -147,8 +147,8 @@ def export_nerfstudio(
 def _file_of(image: ExportedImage, who: str) -> Path:
     require(
         image.path.is_file(),
-        f"{who} needs the file of {image.name!r}{similar_name(image.path)}; those of a COLMAP "
-        "model are looked for in images/ next to sparse/",
+        f"{who} needs the file of {image.name!r}{similar_name(image.path)}; the images of a "
+        "COLMAP model are looked for in images/ next to sparse/",
         path=image.path.resolve(),
     )
     return image.path
@@ -204,7 +204,7 @@ def export_ply(images: Sequence[ExportedImage], points: Points, output: Path) ->
 
 
 def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDArray[np.float64]:
-    """Return the centre and image corners (5, 3) of a camera at a depth, in the world."""
+    """Return a camera's centre and its image corners at a depth, (5, 3), in the world frame."""
     rays = np.concatenate([np.zeros((1, 3)), depth * corner_rays(camera)])
     return cam_from_world.inverse().apply(rays)
 
@@ -270,7 +270,7 @@ def export(
     )
     only_queries = name == "tum" and query is not None
     images, points = _read(None if only_queries else map, query, sensor)
-    require(images, "no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
+    require(images, (f"camera {sensor!r}: " if sensor else "") + "no image has a pose")
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
         inputs = (map.folder.root if isinstance(map, KaptureMap) else map, query)

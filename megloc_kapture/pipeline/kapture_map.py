@@ -38,7 +38,7 @@ class MapKeypoints:
     """Keypoints of one type in a map, in COLMAP's convention, and the points that they observe.
 
     ``index`` holds points and observations as arrays, empty if the type has no points. For stored
-    features of queries, ``folder`` and ``name`` are those of the queries.
+    features of queries, ``folder`` and ``name`` refer to the queries.
     """
 
     folder: KaptureFolder
@@ -125,13 +125,13 @@ class KaptureMap:
         dirs = [features_dirs] if isinstance(features_dirs, Path | str) else features_dirs
         folder = KaptureFolder(path, features_dirs=dirs)
         for features_dir in folder.features_dirs:
-            require(features_dir.is_dir(), "no such folder of features", path=features_dir)
+            require(features_dir.is_dir(), "no such features folder", path=features_dir)
         data = folder.read()
         check_points(folder, "localize in")
         require(
             any(data.cam_from_world(image) is not None for image in data.image_names()),
             "no image of the map has a pose: sensors/records_camera.txt or trajectories.txt is "
-            "missing, or they have other timestamps or sensors",
+            "missing, or their timestamps or sensors differ",
             path=folder.root,
         )
         types = [keypoints_types] if isinstance(keypoints_types, str) else keypoints_types

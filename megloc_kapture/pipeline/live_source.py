@@ -61,7 +61,7 @@ class LocalType:
     """A keypoints type of the map, with its extractor and matchers; plugins are loaded lazily.
 
     ``points`` are the keypoints that observe map points. ``first`` are the keypoints of the first
-    matching: the same, or in guided pyramids those of the base type.
+    matching: the same, or with the guided pyramid the keypoints of the base type.
     """
 
     def __init__(
@@ -200,7 +200,7 @@ class LocalType:
         try:
             _ = self.extractor
         except MissingWeightsError:
-            return f"the weights that extract {self.name} are missing (megloc weights list)"
+            return f"the weights to extract {self.name} are missing (megloc weights list)"
         except DataError as error:
             return error.message
         return ""
@@ -214,7 +214,7 @@ class LocalType:
 
 
 def local_types_of(kapture_map: KaptureMap, options: PipelineOptions) -> list[LocalType]:
-    """Return the keypoints types to match: those in the options, in order, then others by name.
+    """Return the keypoints types to match: those in the options, in order, then the others by name.
 
     Types without map points are matched only if the options name them, to rank candidates.
     """
@@ -272,7 +272,7 @@ def extract_again(
     require(
         again >= _MIN_FOUND_AGAIN * observed,
         f"the map has no descriptors, and extracting {extractor.name} again finds only "
-        f"{again} of {observed} observed keypoints: it was made with other options",
+        f"{again} of {observed} observed keypoints: the map was made with other options",
         path=kapture_map.folder.root,
     )
     return descriptors_of
@@ -305,8 +305,8 @@ class MapMatching:
     """Preparation, retrieval, matching and reranking of queries against a map; thread-safe.
 
     Retrieval uses the global features that map and query share; if some are in the options, only
-    those. If none are shared, it uses the options' VLAD and stored types, or else all of them.
-    Missing vectors of map images are computed in memory.
+    those. If none are shared, it uses the options' types that are VLAD or stored in the map, or
+    else all the options' types. Missing vectors of map images are computed in memory.
     """
 
     def __init__(self, kapture_map: KaptureMap, options: PipelineOptions) -> None:
@@ -323,7 +323,7 @@ class MapMatching:
         self._lock = threading.RLock()
 
     def image(self, query: Query) -> QueryImage:
-        """Prepare a query lazily, as the stage of pre-processing does."""
+        """Prepare a query lazily, as the preprocessing stage does."""
         return QueryImage(query, self.options, lambda: self._classes)
 
     @cached_property

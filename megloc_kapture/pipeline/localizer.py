@@ -165,7 +165,7 @@ class Localizer:
     def ranked(self, query: Query) -> list[str]:
         """Return the given candidates of a query, or the most similar map images, best first.
 
-        The latter are reranked if enabled.
+        The latter are reranked if reranking is enabled.
         """
         return self.matching.ranked(self.matching.image(query))
 

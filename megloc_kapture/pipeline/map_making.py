@@ -1,8 +1,8 @@
 """Plans that make a map without queries, from posed images, photographs or COLMAP models.
 
 Photographs are matched, verified by a two-view model and reconstructed by COLMAP's mapper; with
-these poses, the map is made as for posed images. COLMAP models are imported into the user's cache,
-and imported again if a file changes.
+the resulting poses, the map is made as for posed images. COLMAP models are imported into the user's
+cache, and imported again if a file changes.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def options_of_photographs(
         "with the map's cameras",
     )
     check_option(
-        options.map == "triangulate", f"map = {options.map}: points of photographs are triangulated"
+        options.map == "triangulate", f"map = {options.map}: photographs need triangulated points"
     )
     return options
 
@@ -194,7 +194,7 @@ def _structure_options(
         gps = photographs.gps()
         require(
             len(gps) >= MIN_IMAGES,
-            f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} "
+            f"--scale gps: {len(gps)} photographs have a GPS position, but at least {MIN_IMAGES} "
             "are needed",
         )
     elif len(scale) == 3:
@@ -278,8 +278,8 @@ def import_colmap(
     """Write a COLMAP reconstruction as a kapture map into an empty folder and return counts.
 
     The unit is unknown unless given. A model of poses alone becomes a kapture folder of poses. If
-    a model has no points, or too few of its keypoints are detected again in its images, these are
-    mapped again with the model's poses and the default preset.
+    a model has no points, or too few of its keypoints are detected again in its images, the images
+    are mapped again with the model's poses and the default preset.
     """
     read = ColmapReconstruction.read(source)
     write_unit(output, unit)

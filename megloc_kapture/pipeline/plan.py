@@ -130,8 +130,8 @@ class Workspace:
     def staging(self, stage: str, mark: str, *, resumes: bool = False) -> Iterator[Path]:
         """Yield the folder to write a stage's output into; remove it at the end.
 
-        If a stage that ``resumes`` fails, its items are kept, for a run with the same ``mark`` (its
-        fingerprint) to continue.
+        If a stage that ``resumes`` fails, its items are kept, so that a run with the same ``mark``
+        (the stage's fingerprint) can continue.
         """
         place = self.partial_path(stage)
         with writing(place):

@@ -24,7 +24,7 @@ from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform, c
 
 
 def check_image(image: Any) -> None:
-    """Raise DataError for anything but an image, such as a tensor, or None from cv2.imread."""
+    """Raise DataError for a tensor, None from cv2.imread, or anything else that is not an image."""
     from PIL import Image
 
     kind = type(image).__name__
@@ -33,11 +33,11 @@ def check_image(image: Any) -> None:
         fits = image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3 and image.size
     else:
         fits = isinstance(image, str | Path | Image.Image)
-    require(fits, f"an image is a file, uint8 (H, W, 3) RGB or a pillow image, got {kind}")
+    require(fits, f"an image must be a file, uint8 (H, W, 3) RGB or a pillow image, got {kind}")
 
 
 def _names(images: Sequence[str] | None) -> tuple[str, ...] | None:
-    """Return names of map images as a tuple; a single name is a list of one."""
+    """Return names of map images as a tuple; a single name becomes a tuple of one."""
     single = isinstance(images, str | Path)
     return None if images is None else tuple(map(str, (images,) if single else images))
 
@@ -49,8 +49,8 @@ class Query:
     Parameters
     ----------
     image : uint8 (H, W, 3) RGB or the path of an image file; optional if features are given.
-    features, global_features : given features, by the map's types; missing local ones are
-        extracted.
+    features, global_features : given features, keyed by the map's types; missing local ones
+        are extracted.
     prior : map images that may be matched, or the name of one; None means all.
     candidates : map images to match, best first, instead of retrieval.
     mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may be missing.
@@ -85,7 +85,7 @@ class Query:
         mask = np.asarray(self.mask)
         require(
             mask.dtype == np.bool_ and mask.shape == shape,
-            f"query {self.name}: a mask is bool {shape}, got {mask.dtype} {mask.shape}",
+            f"query {self.name}: the mask must be bool {shape}, got {mask.dtype} {mask.shape}",
         )
         return mask
 
@@ -109,7 +109,7 @@ class Query:
         shape = (self.camera.height, self.camera.width, 3)
         require(
             image.dtype == np.uint8 and image.shape == shape,
-            f"query {self.name}: its camera needs an image uint8 {shape}, got {image.dtype} "
+            f"query {self.name}: its camera needs a uint8 image {shape}, got {image.dtype} "
             f"{image.shape}",
         )
         return image

@@ -213,7 +213,7 @@ class KaptureQueries(Queries):
             require(
                 reader.config.dsize == other.config.dsize,
                 f"{reader.kind} of type {reader.type_name!r} have dimension {reader.config.dsize}, "
-                f"those of the map {other.config.dsize}; extract both with the same network",
+                f"but those of the map {other.config.dsize}; extract both with the same network",
                 path=self._folder.root,
             )
 
@@ -282,7 +282,7 @@ class Photographs(Queries):
     Without a given camera, images are rotated upright by their EXIF orientation, and the camera
     describes the upright image. Its focal length starts from EXIF or a guess, and is always
     estimated with the pose. A given camera describes the stored pixels, and is scaled to images of
-    another size but the same aspect ratio. Photographs of the same make, model, size and focal
+    a different size but the same aspect ratio. Photographs of the same make, model, size and focal
     length share a camera, as do the frames of a video.
 
     Parameters

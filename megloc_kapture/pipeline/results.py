@@ -35,7 +35,7 @@ _POSE = COLUMNS.split()[1:]
 
 
 class Results(Mapping[str, Pose | Failure]):
-    """Mapping from image name to result, sorted by name, but rig images may be adjacent.
+    """Mapping from image name to result, sorted by name, except that rig images may be adjacent.
 
     Access to an image localizes it and all images before it. Photographs share cameras, so the
     first access localizes all of them. Results are cached; an unusable image gives a Failure.

@@ -137,7 +137,7 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
             "poses cannot be derived from the rig: the queries have no rigs.txt",
             path=localized,
         )
-        # from the camera with the most inliers; fallback poses are replaced, never propagated
+        # use the rig camera with the most inliers; fallback poses are replaced, never propagated
         known = {
             image: Pose(pose, num_inliers=results[image].num_inliers or 0)
             for image, pose in poses.items()
@@ -164,7 +164,7 @@ def _ltvl(results: _Results, side: SideTables, unreadable: Collection[str]) -> _
     posed = [image for image in images if image in poses]
     unnamed = [] if names else [i for i in posed if not is_name(name_by_rule(i, rule))]
     if unnamed:
-        message = "%d images are left out: names in a pose file cannot contain white space: %s%s"
+        message = "%d images are left out, as names in a pose file cannot contain white space: %s%s"
         more = ", ..." if len(unnamed) > 1 else ""
         _log.warning(message, len(unnamed), repr(unnamed[0]), more)
         posed = sorted(set(posed) - set(unnamed))

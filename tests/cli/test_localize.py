@@ -80,7 +80,7 @@ def test_a_foreign_map_with_its_features_needs_no_weights(
     # pairs with few matches would be extracted again, which needs the weights
     remarks = {"; ".join(row.remarks) for row in read_status(result / "status.csv").values()}
     skipped = (
-        f"guided pyramid matching: the weights that extract {local_type} are missing "
+        f"guided pyramid matching: the weights to extract {local_type} are missing "
         "(megloc weights list)"
     )
     assert remarks == {skipped if preset == "megloc" else ""}

@@ -417,5 +417,5 @@ def test_explain_runs_nothing_and_needs_no_data(
 def test_pairs_by_covisibility_need_a_model() -> None:
     name = "synthetic-4seasons"
     options = options_of_preset(assignments=['mapping_pairs.by=["covisibility"]'])
-    with pytest.raises(OptionError, match=f"{name} comes with no model: .*by covisibility"):
+    with pytest.raises(OptionError, match=f"{name} comes with no model, .*by covisibility"):
         plan_evaluation(Run(choose_dataset(name, None), "classic", options))

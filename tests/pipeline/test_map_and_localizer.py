@@ -268,8 +268,8 @@ def queries(workspace: Path, scene: Path) -> list[Query]:
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((10, 10, 3), np.uint8), r"image uint8 \(300, 400, 3\), got uint8 \(10, 10, 3\)"),
-        (np.zeros((300, 400, 3)), r"an image is a file, uint8 \(H, W, 3\) .*, got float64"),
+        (np.zeros((10, 10, 3), np.uint8), r"uint8 image \(300, 400, 3\), got uint8 \(10, 10, 3\)"),
+        (np.zeros((300, 400, 3)), r"an image must be a file, uint8 \(H, W, 3\) .*, got float64"),
     ],
     ids=["size", "float"],
 )
@@ -292,7 +292,7 @@ def test_masked_pixels_have_no_features(
     assert isinstance(half, Pose) and isinstance(whole, Pose)
     assert half.num_matches != whole.num_matches
     assert replace(query, mask=str(image.with_name("no_mask.png"))).read_mask() is None
-    with pytest.raises(DataError, match="a mask is bool"):
+    with pytest.raises(DataError, match="the mask must be bool"):
         localizer.localize_query(replace(query, mask=mask[:10]))
 
 
