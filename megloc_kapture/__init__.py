@@ -72,7 +72,7 @@ __all__ = [
     "train",
 ]
 
-# lazy: an error class does not import numpy, and a value type does not import the solvers
+# imported lazily, so that error classes do not load numpy, nor value types the solvers
 _LAZY = {
     "values": ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"),
     "pipeline.kapture_map": ("KaptureMap",),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class NetworkOptions(Options):
     """Device and precision of networks: options of a plugin, or part of a run's context.
 
-    Those of a run apply to networks whose own options do not set them.
+    The run's values apply to networks whose own options do not set them.
     """
 
     device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
@@ -82,7 +82,7 @@ def checked_array(
         fits = array.ndim == len(shape) and all(b in (None, a) for a, b in lengths)
         if fits and array.dtype.name in dtypes:
             if not np.isfinite(array).all():
-                raise PluginError(f"{who}: values that are not finite")
+                raise PluginError(f"{who}: some values are not finite")
             return array
         actual = f"{array.dtype} {array.shape}"
     free = iter("ND")
@@ -103,7 +103,7 @@ def option_fault(error: ValidationError, model: type[Options]) -> str:
 def plugin_class(group: str, name: str) -> Any:
     """Return the class registered as ``name`` in ``group``; PluginError if it cannot be loaded."""
     if not isinstance(name, str):
-        raise PluginError(f"a plugin is given by its registered name, got {name!r}")
+        raise PluginError(f"a plugin must be given by its registered name, got {name!r}")
     entries = [entry for entry in entry_points(group=group) if entry.name == name]
     if not entries:
         known = suggestion(name, plugin_names(group), listed="registered: ")
@@ -159,7 +159,7 @@ def is_ours(kind: type) -> bool:
 
 
 def has_precision(plugin: object) -> bool:
-    """Return whether a plugin has the option ``half_precision``, as those that run networks do."""
+    """Return whether a plugin has the option ``half_precision``, as plugins with networks do."""
     return hasattr(getattr(plugin, "options", None), "half_precision")
 
 

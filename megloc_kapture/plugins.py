@@ -1,9 +1,9 @@
 """Plugin protocols; ``plugin_loading.py`` loads plugins by name.
 
 A plugin is a class registered under one of the entry-point groups below, as the built-in ones are.
-Its instances must be picklable. It may have ``Options``, derived from ``values.Options``, the only
-argument of its constructor, and a method ``weights() -> dict[str, str]``: the sha256 of each weight
-file by name, which becomes part of a stage's fingerprint and manifest.
+Its instances must be picklable. It may have a class ``Options``, derived from ``values.Options``,
+whose instance is the constructor's only argument, and a method ``weights() -> dict[str, str]``: the
+sha256 of each weight file by name, which becomes part of a stage's fingerprint and manifest.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class LocalFeatureExtractor(Protocol):
 
 
 class GlobalFeatureExtractor(Protocol):
-    """Group ``megloc_kapture.global_features``: image to one vector, compared by cosine.
+    """Group ``megloc_kapture.global_features``: image to one vector, compared by cosine similarity.
 
     An optional ``describe_many(images)`` returns the vectors, float32 (B, D), of B images of one
     size.
@@ -329,7 +329,7 @@ class RenderedDataset(Protocol):
         """Return all parameters that determine the files."""
 
     def write(self, root: Path, work: Any) -> Mapping[str, float]:
-        """Render the dataset below ``root``, with a ``megloc_kapture.stages.work.Work``.
+        """Render the dataset below ``root``; ``work`` is a ``megloc_kapture.stages.work.Work``.
 
         Return counts for the log. The bytes depend on the options alone. Raise OutputError if the
         files cannot be written.

@@ -34,8 +34,8 @@ ONE_FOCAL_MODELS = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
 
-# a shorter focal length, relative to the larger side of the image, is not in pixels; that of a lens
-# of 220 degrees is 0.13
+# a focal length below this fraction of the image's longer side is not in pixels; that of a
+# 220-degree fisheye lens is 0.13
 _SHORTEST = 0.02
 
 # `megloc localize`, `Localizer` and `megloc serve` reject poses with a lower confidence;
@@ -56,7 +56,7 @@ def listed(value: Any) -> Any:
 
 
 class Options(BaseModel):
-    """Base of all option models: frozen, validated, without unknown keys."""
+    """Base of all option models: frozen and validated; unknown keys are rejected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
@@ -143,7 +143,7 @@ class Camera:
 
 
 def check_camera(camera: Any) -> None:
-    """Raise DataError for anything but a :class:`Camera` in pixels, such as a matrix K."""
+    """Raise DataError for a matrix K or anything else that is not a :class:`Camera` in pixels."""
     if not isinstance(camera, Camera):
         raise DataError(
             "a camera must be a megloc_kapture.Camera (Camera.from_colmap converts pycolmap's), "
@@ -180,7 +180,7 @@ class RigidTransform:
         """Create a transform from a rotation matrix (3, 3) and a translation (3,)."""
         matrix = np.asarray(rotation, dtype=np.float64)
         if matrix.shape != (3, 3):
-            raise DataError(f"a rotation matrix has the shape (3, 3), got {matrix.shape}")
+            raise DataError(f"a rotation matrix must have the shape (3, 3), got {matrix.shape}")
         is_orthonormal = np.abs(matrix.T @ matrix - np.eye(3)).max() <= 0.01  # False for nan
         if not is_orthonormal or np.linalg.det(matrix) < 0:
             raise DataError(f"not a rotation matrix: {matrix.tolist()}")
@@ -220,7 +220,7 @@ class RigidTransform:
         return matrix
 
     def inverse(self) -> RigidTransform:
-        """Return ``b_from_a`` of an ``a_from_b``."""
+        """Return ``b_from_a`` for a transform ``a_from_b``."""
         w, x, y, z = self.quat_wxyz
         turned = RigidTransform((w, -x, -y, -z), (0.0, 0.0, 0.0))
         tx, ty, tz = turned._applied(self.translation)

@@ -183,7 +183,7 @@ def test_a_second_package_may_not_mix_up_names_and_groups(
         (np.ones((1, 2)), r"got float64 \(1, 2\), expected"),
         (np.ones(2, np.float32), r"got float32 \(2,\), expected"),
         (np.ones((1, 3), np.float32), r"got float32 \(1, 3\), expected"),
-        (np.full((1, 2), np.nan, np.float32), "values that are not finite"),
+        (np.full((1, 2), np.nan, np.float32), "some values are not finite"),
     ],
 )
 def test_arrays_of_plugins_are_checked(array: Any, message: str) -> None:
@@ -204,7 +204,7 @@ def test_outputs_are_checked_from_python(outside: Path, monkeypatch: pytest.Monk
         megloc.extract("grid", image)
 
     given: Any = kind()
-    with pytest.raises(PluginError, match="a plugin is given by its registered name, got <outside"):
+    with pytest.raises(PluginError, match="must be given by its registered name, got <outside"):
         megloc.extract(given, image)
 
     def reject(*_: object) -> None:

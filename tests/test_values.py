@@ -74,7 +74,7 @@ def test_from_matrix_is_stable_everywhere(axis: list[float], angle: float) -> No
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        (np.eye(4), r"has the shape \(3, 3\), got \(4, 4\)"),
+        (np.eye(4), r"must have the shape \(3, 3\), got \(4, 4\)"),
         (np.diag([1.0, 1.0, -1.0]), "not a rotation matrix"),
         (2 * np.eye(3), "not a rotation matrix"),
         (np.ones((3, 3)), "not a rotation matrix"),
