@@ -3,7 +3,7 @@
     megloc serve my_map &
     python serve_client.py photo.jpg PINHOLE,1920,1080,1371,1371,960,540
 
-The camera is MODEL,WIDTH,HEIGHT,PARAMETERS, as in COLMAP; --url and --token select the service.
+The camera is MODEL,WIDTH,HEIGHT,PARAMETERS, as in COLMAP; --url and --token are the service's.
 Needs only the standard library.
 """
 

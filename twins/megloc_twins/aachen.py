@@ -22,7 +22,7 @@ from megloc_twins.sparse_models import Depths, as_nvm, exact_tracks, write_colma
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import query_frames
 
-# the published model has y down, and is some hundred metres from the origin
+# the published model has y down, and is several hundred metres from the origin
 OFFICIAL_FROM_WORLD = settled_pose(
     np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.array([738.5, -6.25, -41.75])
 )
@@ -46,9 +46,9 @@ class AachenTwinOptions(TwinOptions):
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
     stations_per_place: int = Field(default=8, ge=3, description="spots of three photographs each")
     sequence_images: int = Field(default=5, ge=2, description="images of a place's sequence")
-    day_queries: int = Field(default=24, ge=1, description="query images by day, all places")
-    night_queries: int = Field(default=16, ge=1, description="query images at night, all places")
-    additional_night_queries: int = Field(default=8, ge=1, description="that v1.0 lacks")
+    day_queries: int = Field(default=24, ge=1, description="query images by day, in total")
+    night_queries: int = Field(default=16, ge=1, description="query images at night, in total")
+    additional_night_queries: int = Field(default=8, ge=1, description="night queries only in v1.1")
     width: int = Field(default=640, ge=64, description="image width in px; a portrait's height")
     height: int = Field(default=480, ge=48, description="image height in px")
 
@@ -58,7 +58,7 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
 
     ``images_upright/``, ``3D-models/`` (v1.0's NVM and ``database_intrinsics.txt``;
     ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
-    of the original: numbers of database images are unordered, the NVM has another order, feature
+    of the original: database images are numbered at random, the NVM is ordered differently, feature
     numbers in the NVM have gaps, v1.1's night list replaces v1.0's, lists lack the last line break,
     and some images below ``query/`` are in no list.
     """
@@ -80,7 +80,7 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
             path = root / f"queries/{when}_time_queries_with_intrinsics.txt"
             _write_cameras(path, listed, last_line_ends=False)
         queries = in_frame(frames.queries(), OFFICIAL_FROM_WORLD)
-        # nothing was taken at the same time
+        # no two images were taken at the same time
         timed = (
             [replace(frame, timestamp=time) for time, frame in enumerate(some)]
             for some in (mapping, queries)
@@ -184,13 +184,13 @@ def _map_frame(
     sun: tuple[float, float],
     rng: Generator,
 ) -> Frame:
-    """Return a hand-held image at a position; ``names`` are those of image and sensor."""
+    """Return a hand-held image at a position; ``names`` are the image's and the sensor's."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
     return Frame(
         name=names[0],
         condition="day",
         place=place.index,
-        timestamp=0,  # nothing was taken at the same time
+        timestamp=0,  # replaced when the frames are written
         sensor_id=names[1],
         camera=camera,
         cam_from_world=looking_at(at, yaw, pitch, roll) @ place.place_from_world,

@@ -19,7 +19,7 @@ Box = tuple[int, int, int, int]  # x0, y0, x1, y1, texels
 Colour = NDArray[np.float32]  # (3,), 0..255
 Picture = NDArray[np.float32]  # (H, W, 3), 0..255
 TILE = 512  # texels; the period of a material
-_FINE = 16  # OpenCV's drawing functions get positions in sixteenths of a texel
+_FINE = 16  # OpenCV's drawing functions take positions in sixteenths of a texel
 _SMOOTH = cv2.LINE_AA, 4  # their last arguments: antialiasing, fractional bits of positions
 _MATERIALS = {  # colour, and the smallest random factor of each channel
     "brick": ((150, 84, 66), 0.8),
@@ -169,7 +169,7 @@ def material_tile(kind: str, seed: int) -> Picture:
     flat = np.broadcast_to(base, (TILE, TILE, 3))
     tile = _blocks(rng, base, kind) if kind in _MASONRY else flat
     if kind in _STAINS:
-        strength, cell, octaves = _STAINS[kind]  # the coarsest octave in texels
+        strength, cell, octaves = _STAINS[kind]  # cell: of the coarsest octave, texels
         tile = shade(tile, 1 + strength * periodic_noise(rng, TILE, cell=cell, octaves=octaves))
     if kind == "plaster":
         pits = np.clip(periodic_noise(rng, TILE, cell=28, octaves=2) - 1.6, 0, 1)

@@ -160,7 +160,7 @@ def drive_moments(options: SyntheticWorldOptions, recording: str, stops: int) ->
 
 
 def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
-    """Return a place in winter: other leaves, patches and markings, on wet asphalt."""
+    """Return a place in winter: different leaves, patches and markings, on asphalt."""
     place = build_place(options, index)
     seed = seed_of(options.seed, "winter", index)
     recipes = []
@@ -231,7 +231,7 @@ def _write_recording(
     frames = [frame for moment in moments for frame in moment.frames]
     finish = partial(_write_grey, folder.parent)
     build = winter_place if recording == WINTER else build_place
-    # with the same dirt as in the map, the bonnet would yield the best matches of queries
+    # with the same dirt as in the map, the bonnet would yield the queries' best matches
     seed = options.seed + (list(_SUN).index(recording) << 32)
     render_frames(options, frames, finish, build=build, sky_seed=seed, work=work)
     times = (moment.timestamp for moment in moments)  # most have no images
@@ -252,7 +252,7 @@ def _write_slam_world(folder: Path, seed: int, keyframes: list[Moment]) -> None:
     Frames are named as in ``Transformations.txt``.
     """
     rng = stream(seed, "frames", folder.name)
-    # the scenes of different recordings have origins some hundred metres apart
+    # the scenes of different recordings have origins a few hundred metres apart
     east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
     origin = RigidTransform((1.0, 0.0, 0.0, 0.0), (east, north, up))
     place = geodetic(np.array((EARTH_FROM_WORLD @ origin).translation))
@@ -261,7 +261,7 @@ def _write_slam_world(folder: Path, seed: int, keyframes: list[Moment]) -> None:
     e_from_gpsw = _as_written(_settled_earth_from_enu(*place))
     scale = round(float(rng.uniform(0.96, 0.97)), 6)  # metres per unit of the SLAM world
     as_from_world = s_from_as.inverse() @ (w_from_gpsw @ e_from_gpsw.inverse() @ EARTH_FROM_WORLD)
-    # the header has a column more than the rows, as published
+    # the header has one more column than the rows, as published
     columns = "tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, fusion_quality, v3"
     lines = [f"# timestamp_ns, {columns}"]
     for moment in keyframes:
@@ -304,7 +304,7 @@ def _write_relocalization(path: Path, reference: list[Moment], queries: list[Mom
 
 
 def _random_transform(rng: Generator, yaw: float, tilt: float, reach_m: float) -> RigidTransform:
-    """Draw a translation, and a rotation by ``yaw`` about z and ``tilt`` about x and y at most."""
+    """Draw a translation, and a rotation by at most ``yaw`` about z and ``tilt`` about x and y."""
     half = rng.uniform(-1, 1, 3) * (tilt, tilt, yaw) / 2
     cos, sin = settled(np.cos(half)).tolist(), np.diag(settled(np.sin(half))).tolist()
     about_x, about_y, about_z = (

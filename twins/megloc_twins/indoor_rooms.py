@@ -304,7 +304,7 @@ class Floor:
 
 
 def floor_place(modules: int, options: SyntheticWorldOptions, index: int) -> Place:
-    """Return a floor with a number of corridor sections for :func:`render.render_frames`."""
+    """Return a floor with ``modules`` corridor sections for :func:`render.render_frames`."""
     return build_floor(options.seed, index, modules).place
 
 

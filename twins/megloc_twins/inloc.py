@@ -60,8 +60,8 @@ Scans = list[tuple[Float64, list[CoarseView]]]
 class InLocTwinOptions(TwinOptions):
     """Contents of InLoc's twin; ``make eval`` uses the defaults."""
 
-    modules: int = Field(default=2, ge=1, le=20, description="corridor sections with two rooms")
-    queries: int = Field(default=48, ge=2, description="query images, both floors")
+    modules: int = Field(default=2, ge=1, le=20, description="corridor sections, two rooms each")
+    queries: int = Field(default=48, ge=2, description="query images, in total")
     cutout_width: int = Field(default=400, ge=40, description="width of cutouts in px")
     cutout_height: int = Field(default=300, ge=30, description="height of cutouts in px")
     query_width: int = Field(default=640, ge=64, description="width of landscape queries in px")
@@ -208,7 +208,7 @@ def phone_camera(width: int, height: int) -> Camera:
 def build_queries(options: InLocTwinOptions) -> Iterator[Frame]:
     """Yield phone images, floor by floor and zone by zone; a third of them in portrait format.
 
-    A query gets the first of some hundred random poses whose view is covered well by the floor's
+    A query gets the first of up to 400 random poses whose view is covered well by the floor's
     scans, and better than the corresponding view is by scans of similar rooms; else the pose that
     comes closest.
     """
@@ -273,7 +273,7 @@ def _query_poses(
 
 
 def _copies(floors: list[Floor], index: int, zone: Zone) -> Iterator[tuple[int, RigidTransform]]:
-    """Yield floor and transform to each zone of the kind; for corridors also a half turn."""
+    """Yield floor and transform to each zone of the same kind; for corridors also a half turn."""
     half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (MODULE_M, 0.0, 0.0))
     for other_index, floor in enumerate(floors):
         for other in floor.zones:

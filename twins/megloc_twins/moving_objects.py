@@ -116,7 +116,7 @@ class MovingObject:
 
 
 def moving_object_recipes(seed: int) -> list[TextureRecipe]:
-    """Return the textures of all moving objects, which are the first of every place."""
+    """Return the textures of all moving objects, which come first in every place's list."""
     number = seed_of(seed, "movers")
     recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
     for i in range(NUM_CARS):

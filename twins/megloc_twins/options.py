@@ -46,8 +46,8 @@ class SyntheticWorldOptions(TwinOptions):
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
     stations_per_place: int = Field(default=9, ge=3, description="stops of the mapping rig")
-    day_queries: int = Field(default=24, ge=0, description="query images by day, all places")
-    night_queries: int = Field(default=24, ge=0, description="query images at night, all places")
+    day_queries: int = Field(default=24, ge=0, description="query images by day, in total")
+    night_queries: int = Field(default=24, ge=0, description="query images at night, in total")
     width: int = Field(default=640, ge=64, description="image width in px")
     height: int = Field(default=480, ge=48, description="image height in px")
     moving_objects: int = Field(default=2, ge=0, description="people and cars near a camera")

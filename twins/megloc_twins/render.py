@@ -182,7 +182,7 @@ def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
 
 
 class PlaceRenderer:
-    """Renderer of the frames of one place; ``seed`` determines clouds and the bonnet's dirt."""
+    """Renderer of the frames of one place; ``seed`` determines the clouds and the bonnet."""
 
     def __init__(self, place: Place, *, seed: int, supersampling: int) -> None:
         self._place = place
@@ -257,7 +257,7 @@ class PlaceRenderer:
 
 
 def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
-    """Return x, y, z of each sample's surface point, or of the camera, in the place's frame."""
+    """Return x, y, z of each sample's surface point (else of the camera), in the place's frame."""
     rotation = cam_from_place.rotation_matrix().astype(np.float32)
     center = cam_from_place.center().astype(np.float32)
     hit = seen.inverse_depth > 0
@@ -270,7 +270,7 @@ def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float3
 
 
 def _lamp_light(position: tuple[Float32, ...], normal: Float32, lamps: Float32) -> Float32:
-    """Sum cosine over squared distance over all lamps, cut off smoothly at _LAMP_RANGE_M."""
+    """Sum cosine / squared distance over all lamps, cut off smoothly at _LAMP_RANGE_M."""
     total = np.zeros_like(position[0])
     for lamp in lamps:
         dx, dy, dz = (lamp[i] - position[i] for i in range(3))
@@ -295,7 +295,7 @@ def render_frames(
 
     ``finish`` must be picklable and is called in the process that rendered the frame. The frames
     named in ``with_depth`` have ``depth_m``. ``sky_seed``, by default the world's seed, determines
-    the clouds and the dirt on the bonnet.
+    the clouds and the look of the bonnet.
     """
     seed = options.seed if sky_seed is None else sky_seed
     render = partial(_render, options, build, seed, frozenset(with_depth), finish)

@@ -72,8 +72,8 @@ class RobotCarTwinOptions(TwinOptions):
     """Contents of RobotCar Seasons' twin; ``make eval`` uses the defaults."""
 
     num_locations: int = Field(default=3, ge=1, description="locations, at least 60 m apart")
-    stops_per_location: int = Field(default=12, ge=3, description="moments of the map in each")
-    moments_per_condition: int = Field(default=8, ge=2, description="of each other traversal")
+    stops_per_location: int = Field(default=12, ge=3, description="map moments per location")
+    moments_per_condition: int = Field(default=8, ge=2, description="moments per query traversal")
     size_px: int = Field(default=512, ge=64, description="width and height of an image")
 
     def world(self) -> SyntheticWorldOptions:

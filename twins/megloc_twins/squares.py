@@ -36,8 +36,8 @@ _MAX_FURNITURE = 8
 _PLACE_DISTANCE_M = 90.0  # between centres of neighbouring places, before a random shift
 _WALL_TEXELS_PER_M = 100
 _MATERIALS = ("brick", "stone", "plaster")
-_SHARED = 0.6  # of posters, doors and windows, which are equal in all places
-_TEXTURES = {  # width, height in texels; number of shared textures and of those of each place
+_SHARED = 0.6  # probability that a texture is one of those shared by all places
+_TEXTURES = {  # width, height in texels; number of textures shared by all places, and per place
     "window": (156, 192, 3, 3),
     "door": (132, 270, 2, 3),
     "shutter": (240, 300, 1, 2),

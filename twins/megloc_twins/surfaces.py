@@ -24,7 +24,7 @@ _BORDER = 2  # repeated edge texels around each level, for bilinear interpolatio
 class Surfaces:
     """N textured parallelograms.
 
-    In front view, ``edge_u`` points along the texture's rows and ``edge_v`` down its columns;
+    Seen from the front, ``edge_u`` points along the texture's rows and ``edge_v`` down its columns;
     ``edge_u x edge_v`` points away from the viewer. In metres.
     """
 

@@ -1,4 +1,4 @@
-"""The synthetic world as plain kapture: map images of a rig, queries of phones by day and night."""
+"""The synthetic world as plain kapture: map images from a rig, phone queries by day and night."""
 
 from __future__ import annotations
 

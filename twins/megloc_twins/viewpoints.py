@@ -21,8 +21,8 @@ from megloc_twins.squares import Place
 from megloc_twins.surfaces import Surfaces
 
 _DEPTH_TOLERANCE = 0.05  # relative; the other view's depth is read at the nearest coarse pixel
-# largest differences of two views of a point that SIFT can match: angle between the rays, ratio of
-# sizes and of foreshortenings
+# largest differences between two views of a point that SIFT can match: angle between the rays,
+# ratios of sizes and of foreshortenings
 _MAX_ANGLE_DEG = 32.0
 _MAX_SIZE_RATIO = 2.0
 _MIN_BASELINE_DEG = 1.5  # smallest triangulation angle of a point
@@ -187,7 +187,7 @@ def _query_poses(
 
 
 def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: float = 0.0) -> float:
-    """Measure by how much a view lacks support by the map or repeats a map image; 0 is good.
+    """Measure how much a view lacks support from the map or repeats a map image; 0 is good.
 
     Map images with an overlap of at most ``min_overlap`` give no support.
     """
@@ -197,9 +197,9 @@ def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: fl
 
 
 def first_fitting(candidates: Iterable[tuple[float, Item]]) -> Item:
-    """Return the first candidate of (misfit, candidate) with misfit 0, else that with the least.
+    """Return the first candidate with misfit 0, else the one with the smallest misfit.
 
-    Candidates after it are not drawn.
+    ``candidates`` are pairs (misfit, candidate); none is drawn after a misfit of 0.
     """
     drawn = []
     for misfit_and_candidate in candidates:
