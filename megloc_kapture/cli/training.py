@@ -168,7 +168,7 @@ class Render(Working):
     """For --pose: MODEL,WIDTH,HEIGHT,PARAMETERS as in COLMAP."""
     depth: Path | None = None
     """For --pose: write the depth to this file, a 16-bit PNG in thousandths of the map's unit, 0
-    where nothing is rendered."""
+    where nothing is rendered or it exceeds 65.535 units."""
     along: Path | None = None
     """Kapture folder, such as a result: render view and depth of each of its images with a pose."""
     between: Path | None = None
@@ -227,8 +227,8 @@ class Render(Working):
             rendered, depth_m = field.render(camera, pose, appearance=light)
         write_image(self.output, rendered.image)
         if self.depth is not None:
-            stored = np.clip(np.round(depth_m * _MILLIMETRES), 0, 65535).astype(np.uint16)
-            write_image(self.depth, stored)
+            stored = np.round(depth_m * _MILLIMETRES)
+            write_image(self.depth, np.where(stored > 65535, 0, stored).astype(np.uint16))
 
 
 def _pose_of_text(text: str) -> RigidTransform:

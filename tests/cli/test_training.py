@@ -104,7 +104,7 @@ def test_an_interrupted_training_is_resumed(
 
 
 def test_a_view_in_colour_and_depth(
-    megloc: Any, mapping: Path, field: Path, tmp_path: Path
+    megloc: Any, mapping: Path, field: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, depth = tmp_path / "view.png", tmp_path / "depth.png"
     command = ("render", field, pose_text(mapping), "--camera", CAMERA_TEXT, "-o", out)
@@ -114,8 +114,12 @@ def test_a_view_in_colour_and_depth(
     # the walls are 4 to 7 m away; four steps reach the order of magnitude
     assert 1000 < np.median(stored[stored > 0]) < 15000
     megloc(*command).refused("exists; -f overwrites it")
-    assert megloc(*command, "-f", "--appearance", "0000.jpg").status == 0
+    # depth of more than 16 bits is unknown
+    monkeypatch.setattr("megloc_kapture.cli.training._MILLIMETRES", 1e6)
+    light = ("--appearance", "0000.jpg")
+    assert megloc(*command, "--depth", depth, "-f", *light).status == 0
     assert not np.array_equal(read_image_rgb(out), image)
+    assert cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).max() < 65535
 
 
 def test_views_are_rendered_along_the_poses_of_a_folder(
