@@ -30,7 +30,6 @@ def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> megloc.Map:
 
 @pytest.fixture(scope="module")
 def results(built: megloc.Map, scene: Path) -> megloc.Results:
-    """Of the queries, localized when they are asked for."""
     return built.localize(scene / "query")
 
 

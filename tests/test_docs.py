@@ -36,7 +36,6 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def commands(page: Path) -> list[list[str]]:
-    """Words of each ``megloc`` command in a page's blocks."""
     lines = "".join(blocks(page, "")).replace("\\\n", " ").splitlines()
     return [shlex.split(line, comments=True) for line in lines if line.startswith("megloc ")]
 
@@ -109,7 +108,6 @@ def test_files_of_the_repository_that_are_named_exist(page: Path) -> None:
 
 
 def paper_rows() -> list[list[str]]:
-    """Cells of the rows of docs/paper.md that quote the paper."""
     text = (REPOSITORY / "docs" / "paper.md").read_text().split("## The paper's rules")[0]
     rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
     return [row for row in rows if row[0] != "step"]

@@ -28,7 +28,6 @@ REQUIREMENTS = [
 
 
 def pins() -> dict[str, str]:
-    """Version by canonical name, out of constraints.txt."""
     lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
     pairs = (line.split("==") for line in lines if line and not line.startswith("#"))
     return {canonicalize_name(name): version for name, version in pairs}

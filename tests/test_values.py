@@ -141,8 +141,6 @@ def test_values_travel_between_processes_and_say_whether_they_are_poses() -> Non
 
 
 class Lists(Options):
-    """Options that are lists, and others."""
-
     names: tuple[str, ...] = ()
     choices: tuple[PluginChoice, ...] = ()
     optional: tuple[Literal["a", "b"], ...] | None = None

@@ -19,8 +19,6 @@ SMALL = ("--set", "local_features.options.max_keypoints=800")
 
 @dataclass(frozen=True)
 class Done:
-    """Exit status and output of a command."""
-
     status: int
     out: str
     err: str
@@ -42,8 +40,6 @@ Command = Callable[..., Done]
 
 @pytest.fixture
 def megloc(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Run the command in this process."""
-
     def run(*arguments: str | Path) -> Done:
         capsys.readouterr()
         with pytest.raises(SystemExit) as end:
@@ -93,6 +89,5 @@ def foreign(foreign_map: Path, tmp_path: Path) -> Path:
 
 
 def copy_of(folder: Path, place: Path) -> Path:
-    """Copy a folder; links stay links."""
     shutil.copytree(folder, place, symlinks=True)
     return place

@@ -34,8 +34,6 @@ POSES = "submissions/kapture_eval_megloc-classic.txt"
 
 @pytest.fixture
 def evaluate(megloc: Any) -> Callable[..., Any]:
-    """Run ``megloc eval kapture`` with the options of the finished run."""
-
     def run(root: Path, workspace: Path, *arguments: str, status: int = 0) -> Any:
         done = megloc(
             *("eval", "kapture", "--root", root, "--workspace", workspace),
@@ -65,9 +63,6 @@ def reasons(err: str) -> dict[str, str]:
     return dict(reversed(printed))
 
 
-# ------------------------------------------------------------------ the workspace
-
-
 def test_the_workspace_has_the_documented_files(finished: Path, scene: Path) -> None:
     for place in (
         *("mapping", "query", "query_gt", "megloc/protocol.json", "map", "localized"),
@@ -89,9 +84,6 @@ def test_the_workspace_has_the_documented_files(finished: Path, scene: Path) -> 
         link = finished / part / "sensors" / "records_data"
         assert link.readlink() == scene.resolve() / part / "sensors" / "records_data"
     assert [p for p in finished.rglob("*.jpg") if not p.is_symlink() and p.is_file()] == []
-
-
-# ------------------------------------------------------------------ repeated runs
 
 
 def test_the_second_run_does_nothing_and_prints_the_result(
@@ -150,9 +142,6 @@ def test_a_moved_dataset_repeats_the_import_and_a_changed_image_the_features(
     assert reasons(done.err)["import"] == "dataset files changed"
 
 
-# ------------------------------------------------------------------ parts of a run
-
-
 def test_options_are_checked_before_the_run(megloc: Any, tmp_path: Path) -> None:
     command = ("eval", "aachen", "--root", write_v1_0(tmp_path / "root"), "-w", tmp_path / "run")
     done = megloc(*command, "--import-option", "version=1.1", "--dry-run")
@@ -179,9 +168,6 @@ def test_from_uses_files_of_another_tool_as_they_are(
     statuses = read_status(workspace / "localized" / "status.csv")
     candidates = {query: (image,) for query, image in nearest.items()}
     assert {query: status.candidates for query, status in statuses.items()} == candidates
-
-
-# ------------------------------------------------------------------ results
 
 
 def add_query(dataset: Path, name: str) -> None:
@@ -247,7 +233,6 @@ def temporary(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def start(scene: Path, workspace: Path, *more: str) -> subprocess.Popen[str]:
-    """Start a run with two worker processes in a new session."""
     program = str(Path(sys.executable).with_name("megloc"))
     places = ["--root", str(scene), "--workspace", str(workspace)]
     few = ["--set", "local_features.options.max_keypoints=800", "--workers", "2"]

@@ -185,7 +185,6 @@ def poses(scene: Path) -> Poses:
 
 @pytest.fixture
 def place(poses: Poses, tmp_path: Path) -> Path:
-    """A correct pose file."""
     (tmp_path / "poses.txt").write_text(format_pose_file(poses))
     return tmp_path / "poses.txt"
 

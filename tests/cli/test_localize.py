@@ -34,7 +34,6 @@ def medians(result: Path, truth: Path) -> tuple[float, float, float]:
 
 
 def localize(root: Path, output: Path) -> list[str | Path]:
-    """Arguments that localize the folder ``query`` in the folder ``map``."""
     return ["localize", "-i", root / "map", "--query", root / "query", "-o", output]
 
 
@@ -266,12 +265,8 @@ def test_the_result_has_upright_images_with_their_estimated_cameras(
         assert out.image_path(name).is_symlink() == (orientation == 1)
 
 
-# ------------------------------------------------------------------ real photographs
-
-
 @pytest.fixture(scope="module")
 def facade(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A scene with surveyed poses, and a map of it."""
     scene = shared_data / "scenes" / "fountain_p11"
     workspace = tmp_path_factory.mktemp("facade") / "workspace"
     command = ["eval", "kapture", "--root", str(scene), "--workspace", str(workspace)]

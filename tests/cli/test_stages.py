@@ -27,8 +27,6 @@ INLINE = ("--executor", "inline")
 
 @dataclass(frozen=True)
 class Made:
-    """Outputs of the single stages."""
-
     features: Path
     vlad: Path
     mapping_pairs: Path
@@ -195,12 +193,10 @@ def test_device_and_precision_of_networks_are_chosen_by_flags(
 
 @pytest.fixture
 def camera(scene: Path) -> str:
-    """Id of the scene's camera."""
     return KaptureFolder(scene / "query").read().record_of("0001.jpg")[1]
 
 
 def flags(*arguments: str) -> Preprocess:
-    """Return the command with these arguments."""
     import tyro
 
     given = ["-i", "in", "-o", "out", *arguments]

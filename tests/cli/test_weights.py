@@ -80,7 +80,6 @@ def registry_text(address: str) -> str:
 
 @pytest.fixture
 def folder(served: Path) -> Path:
-    """The folder of weights."""
     return served.parent / "weights"
 
 

@@ -33,7 +33,6 @@ def layouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def without(layouts: Path, dataset: str, tmp_path: Path, *gone: str) -> Path:
-    """Return a copy of a layout without some files or folders."""
     root = tmp_path / dataset
     shutil.copytree(layouts / dataset, root)
     for path in (root / name for name in gone):

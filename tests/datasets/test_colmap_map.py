@@ -149,7 +149,6 @@ def test_without_a_database_features_are_extracted_again(colmap_room: Path, tmp_
 
 
 def write_type(room: Path, kind: int, size: int) -> None:
-    """Change the type and size of all descriptors."""
     with sqlite3.connect(room / "database.db") as connection:
         images = connection.execute("SELECT image_id, rows FROM keypoints").fetchall()
     connection.close()
@@ -181,7 +180,6 @@ def test_types_of_features_are_named_after_their_extractor(
 
 
 def rename(room: Path, names: dict[str, str]) -> None:
-    """Give images of a workspace other names, in all of its parts."""
     model = pycolmap.Reconstruction(room / "sparse" / "0")
     for image in model.images.values():
         if image.name in names:
@@ -490,9 +488,6 @@ def test_the_exact_name_takes_precedence_over_another_suffix(tmp_path: Path) -> 
     assert KaptureFolder(tmp_path).descriptors("sift").read("db/d.jpg").shape == (0, 128)
     read = KaptureFolder(tmp_path).keypoints("sift").read("db/a.jpg")
     assert np.array_equal(read, written["db/a.jpg"][0][:, :2])
-
-
-# ------------------------------------------------------------------ the database
 
 
 def test_backslashes_in_a_database_separate_folders(tmp_path: Path) -> None:

@@ -11,11 +11,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.datasets.kapture_folders import import_kapture_folders, input_files
-from megloc_kapture.datasets.official import (
-    OfficialDataset,
-    read_ground_truth,
-    write_official,
-)
+from megloc_kapture.datasets.official import OfficialDataset, read_ground_truth, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io import dataset_tables as tables
 from megloc_kapture.io.images import write_image

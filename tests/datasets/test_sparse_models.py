@@ -55,7 +55,6 @@ def file(path: Path, lines: list[str], end: str = "\n") -> Path:
 
 
 def check_model(model: NvmModel) -> None:
-    """Check the values of ``MODEL``."""
     assert model.names == ("db/7.jpg", "db/8.jpg")
     assert model.focal_px.tolist() == [1000.0, 900.5]
     assert model.k_colmap.tolist() == [-0.08, 0.25]
@@ -126,7 +125,6 @@ def observed(data: kapture.Kapture, folder: Path) -> list[tuple[int, str, float,
 
 
 def check_against_kapture(model: NvmModel, data: kapture.Kapture, folder: Path) -> None:
-    """Poses, distortion, points and observations."""
     points = model.points
     merged = np.hstack([points.xyz, points.rgb])
     assert np.allclose(merged, data.points3d.as_array(), atol=1e-9)

@@ -62,7 +62,6 @@ def write_recording(
 
 
 def write_two_recordings(root: Path) -> Path:
-    """Write a recording with poses and images of two frames, and a recording without."""
     write_calibration(root / "calibration")
     write_recording(root, DAY, (A, B))
     write_recording(root, SNOW, (A + 5, B + 5), rows=None)

@@ -57,7 +57,6 @@ def robotcar_with_kapture(official: Path, place: Path, size_px: tuple[int, int])
 
 
 def without_images(folder: Path, gone: str) -> None:
-    """Remove the images with a text in their names from a kapture folder's records."""
     data = kapture_from_dir(str(folder))
     for time, sensor, name in list(kapture.flatten(data.records_camera)):
         if gone in name:
@@ -92,7 +91,6 @@ def assert_same_dataset(
 
 
 def assert_linked(dataset: OfficialDataset, output: Path, images: Path) -> None:
-    """Check that each part has links to exactly its images."""
     write_official(dataset, output)
     for part in ("mapping", "query"):
         folder = KaptureFolder(output / part)

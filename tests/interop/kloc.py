@@ -26,12 +26,10 @@ def kloc(tool: str, *arguments: str | Path) -> str:
 
 
 def kapture_tool(tool: str, *arguments: str | Path) -> str:
-    """Run a console script of kapture; return its output."""
     return _run([str(Path(sys.executable).with_name(tool)), *map(str, arguments)])
 
 
 def megloc(*arguments: str | Path) -> str:
-    """Run ``megloc``; return its output."""
     return _run([str(Path(sys.executable).with_name("megloc")), *map(str, arguments)])
 
 
@@ -42,7 +40,6 @@ def _run(command: Sequence[str]) -> str:
 
 
 def proxy(place: Path, sensors_of: Path, linked: dict[str, Path]) -> Path:
-    """Make a kapture folder of links to sensors and to data below reconstruction/."""
     place.mkdir(parents=True)
     (place / "sensors").symlink_to(sensors_of.resolve() / "sensors")
     for name, target in linked.items():
@@ -53,7 +50,6 @@ def proxy(place: Path, sensors_of: Path, linked: dict[str, Path]) -> Path:
 
 
 def merged(place: Path, mapping: Path, query: Path, *, skip: Sequence[str] = ()) -> Path:
-    """Merge map and query by kapture's tool; ``skip`` names data to leave out."""
     skipped = ["-s", *skip] if skip else []
     images = ["--image_transfer", "link_absolute", "--keep-sensor-ids"]
     kapture_tool("kapture_merge", "-i", mapping, query, "-o", place, *images, *skipped)

@@ -49,10 +49,7 @@ def write_layout(root: Path) -> None:
     individual = root / "3D-models/individual"
     for location in ("001", "002"):
         folder = individual / f"colmap_reconstructions/{location}_aligned"
-        put(
-            folder / "cameras.txt",
-            "".join(f"{k} SIMPLE_RADIAL 8 6 10 4 3 0\n" for k in (1, 2, 3)),
-        )
+        put(folder / "cameras.txt", "".join(f"{k} SIMPLE_RADIAL 8 6 10 4 3 0\n" for k in (1, 2, 3)))
         images = ""
         for number, place in REFERENCE.items():
             for k, camera in enumerate(CAMERAS):

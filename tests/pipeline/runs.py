@@ -47,7 +47,6 @@ def run_in(
 def evaluated(
     root: Path, source: Path | DatasetChoice, options: PipelineOptions, **how: Any
 ) -> Workspace:
-    """Run the stages in a new workspace."""
     workspace = Workspace(root)
     run_in(workspace, source, options, **how)
     return workspace
@@ -73,7 +72,6 @@ def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, 
 
 
 def manifest(stage: str, **changes: Any) -> Manifest:
-    """Return the manifest of a finished stage."""
     content: dict[str, Any] = {"options": {}, "inputs": {}, "outputs": (), "versions": {}}
     content |= {"seconds": 1.5, "started": "2024-01-01T00:00:00"}
     mark = f"print of {stage}"

@@ -12,17 +12,8 @@ from corner import write_scene
 from megloc_kapture import KaptureMap, Localizer, Pose
 from megloc_kapture.cli.main import main
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture import (
-    KaptureData,
-    KaptureFolder,
-    read_pairs,
-    write_sensors,
-)
-from megloc_kapture.io.tables import (
-    CONSISTENCY_FILE,
-    read_match_counts,
-    read_status,
-)
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, read_pairs, write_sensors
+from megloc_kapture.io.tables import CONSISTENCY_FILE, read_match_counts, read_status
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results

@@ -34,7 +34,6 @@ from tests.pipeline.runs import errors
 
 
 def shift_keypoints(root: Path, shift_px: float) -> None:
-    """Store the keypoints of a map shifted."""
     reader = KaptureFolder(root).keypoints("rootsift")
     arrays = {image: reader.read(image) for image in reader.names}
     writer = FeatureWriter(root, "keypoints", "rootsift", reader.config)
@@ -43,7 +42,6 @@ def shift_keypoints(root: Path, shift_px: float) -> None:
 
 
 def shift_intrinsics(root: Path, shift_px: float) -> None:
-    """Store the principal points of a map shifted."""
     data = KaptureFolder(root).read()
     moved = {
         name: Sensor.from_camera(shift_principal_point(sensor.camera(), shift_px))
@@ -103,7 +101,6 @@ def test_queries_have_the_origin_of_their_map(workspace: Path, map_copy: Path, s
 
 
 def add_type(root: Path, name: str) -> None:
-    """Add a copy of the points and keypoints under another type."""
     for kind in ("keypoints", "descriptors"):
         folder = root / "reconstruction" / kind
         shutil.copytree(folder / "rootsift", folder / name)
@@ -169,7 +166,6 @@ def stripped(map_copy: Path) -> KaptureMap:
 
 
 def again(opened: KaptureMap, **options: float) -> dict[str, np.ndarray]:
-    """Return descriptors of the map by RootSIFT with the given options."""
     extractor = RootSift(RootSiftOptions(**options))  # type: ignore[arg-type]
     return extract_again(opened, opened.keypoints["rootsift"], extractor)
 
@@ -220,7 +216,6 @@ def test_extractors_are_recognised_by_names_of_other_tools(
 
 
 def few(*assignments: str) -> PipelineOptions:
-    """Return the options that the map was made with."""
     keypoints = "local_features.options.max_keypoints=800"
     return options_of_preset(assignments=[keypoints, *assignments])
 
@@ -242,13 +237,11 @@ def truth(scene: Path) -> KaptureData:
 
 @pytest.fixture(scope="module")
 def image(scene: Path) -> Path:
-    """The image of the query 0004.jpg."""
     return scene / "query" / "sensors" / "records_data" / "0004.jpg"
 
 
 @pytest.fixture(scope="module")
 def queries(workspace: Path, scene: Path) -> list[Query]:
-    """The four queries with their features."""
     folder = KaptureFolder(scene / "query", features_dirs=[workspace])
     data = folder.read()
     keypoints, descriptors = folder.keypoints("rootsift"), folder.descriptors("rootsift")

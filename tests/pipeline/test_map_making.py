@@ -18,12 +18,7 @@ from scipy.spatial.transform import Rotation
 import megloc_kapture as megloc
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
-from megloc_kapture.io.dataset_tables import (
-    World,
-    read_unreadable,
-    write_unreadable,
-    write_world,
-)
+from megloc_kapture.io.dataset_tables import World, read_unreadable, write_unreadable, write_world
 from megloc_kapture.io.files import user_cache
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder

@@ -35,8 +35,6 @@ from tests.worlds import folder_bytes
 
 
 class Step(Stage):
-    """A stage with given inputs, outputs and function."""
-
     def __init__(
         self,
         name: str,
@@ -292,11 +290,7 @@ def test_counts_read_as_english(name: str, value: float, text: str) -> None:
     assert describe(StageReport("a", "run", 0.04, {name: value}, "")) == f"a: {text}; 0.0 s"
 
 
-# ---------------------------------------------------------------------------------- workspaces
-
-
 def use(workspace: Workspace) -> None:
-    """Publish the output of a stage."""
     with workspace.lock(), workspace.staging("a", "1") as out:
         (out / "a.txt").write_text("a")
         workspace.publish(out, ("a.txt",))
@@ -393,7 +387,6 @@ OPTIONS = ("local_features=corners", "global_features.options.num_clusters=4")
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The installed package of the plugins."""
     site = tmp_path / "site"
     info = site / "patches-1.2.dist-info"
     info.mkdir(parents=True)
@@ -457,14 +450,12 @@ class Runs:
         return {report.name: report for report in reports}
 
     def stopped(self, label: str, number: int) -> Path:
-        """Stop a run; return the stage's unfinished folder."""
         with pytest.raises(Stopped):
             self.run(stop_at=(label, number))
         (left,) = (self.root / ".partial").iterdir()
         return left
 
     def check_undisturbed(self) -> None:
-        """Compare the outputs with those of a new run without interruptions."""
         fresh = replace(self, root=self.root.with_name("undisturbed"), progress={})
         shutil.rmtree(fresh.root, ignore_errors=True)
         fresh.run()
@@ -472,7 +463,6 @@ class Runs:
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Return the outputs of stages, by path."""
     hidden = ("stages/", "megloc/", "timing", ".")
     files = folder_bytes(root).items()
     return {name: content for name, content in files if not name.startswith(hidden)}

@@ -184,7 +184,6 @@ PYRAMID = ("mode=all", "scales=[0.5]", "rotations_deg=[0]", "min_matches=100")
 
 @pytest.fixture(scope="module")
 def guided(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """A run with guided pyramids."""
     options = options_of_preset(assignments=[FEW, *(f"guided_pyramid.{one}" for one in PYRAMID)])
     root = tmp_path_factory.mktemp("pyramid") / "workspace"
     return evaluated(root, scene, options, last="query_rematching")

@@ -388,7 +388,6 @@ NAME, FOLDER = "Aachen_v1_1_eval_megloc-classic", "4Seasons_eval_megloc-1.5"
 
 
 def pose_file(run: Path, text: str, *, folder: bool = False) -> Path:
-    """Write a pose file, or a folder of two, with its provenance."""
     place = run / "submissions" / (FOLDER if folder else f"{NAME}.txt")
     files = [place / "a.txt", place / "b.txt"] if folder else [place]
     for file in files:

@@ -59,7 +59,6 @@ STAGES = [
 
 
 def megloc(_: str, arguments: Sequence[str]) -> float:
-    """Our command, in this process."""
     with pytest.raises(SystemExit) as end:
         main([*arguments, "--quiet"])
     assert end.value.code == 0, arguments
@@ -77,7 +76,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module", autouse=True)
 def added(made: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with all weights."""
     folder = tmp_path_factory.mktemp("weights")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MEGLOC_WEIGHTS", str(folder))
@@ -87,7 +85,6 @@ def added(made: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> It
 
 @pytest.fixture(scope="module")
 def workspace(added: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run; read only."""
     wiring = Wiring("random", SCENE, WIRINGS["random"].options)
     return run(wiring, tmp_path_factory.mktemp("whole"), megloc, changed())
 

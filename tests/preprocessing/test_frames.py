@@ -52,7 +52,6 @@ def painted(
     width: int = WIDTH,
     height: int = HEIGHT,
 ) -> NDArray[np.uint8]:
-    """Return an image (H, W, 3) of a function of pixel coordinates."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     grey = np.clip(np.rint(brightness(x, y)), 0, 255).astype(np.uint8)
     return np.repeat(grey[:, :, None], 3, axis=2)
@@ -75,7 +74,6 @@ def test_both_sides_become_multiples(width: int, height: int) -> None:
 
 
 def points_seen() -> NDArray[np.float64]:
-    """3D points (200, 3) in front of the cameras."""
     rng = np.random.default_rng(0)
     rays = np.concatenate([rng.uniform(-0.6, 0.6, (200, 2)), np.ones((200, 1))], axis=1)
     return rays * rng.uniform(0.5, 50, (200, 1))

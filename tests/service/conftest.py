@@ -20,7 +20,6 @@ OPTIONS = options_of_preset(assignments=CHANGES)
 
 @pytest.fixture(scope="session")
 def served_map(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Our map of the scene; not to be written into."""
     workspace = tmp_path_factory.mktemp("served") / "workspace"
     return megloc.build_map(
         scene / "mapping", set=CHANGES, workspace=workspace
@@ -35,7 +34,6 @@ def localizer(served_map: Path) -> Localizer:
 
 @pytest.fixture(scope="session")
 def photos(scene: Path) -> list[Photo]:
-    """The query images of the scene."""
     folder = KaptureFolder(scene / "query")
     data = folder.read()
     return [Photo(folder.image_path(name), data.camera_of(name)) for name in data.image_names()]
@@ -43,6 +41,5 @@ def photos(scene: Path) -> list[Photo]:
 
 @pytest.fixture
 def client(localizer: Localizer) -> Iterator[TestClient]:
-    """A client of a service without token."""
     with client_of(localizer, threads=2) as result:
         yield result

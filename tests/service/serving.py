@@ -23,16 +23,13 @@ class Photo:
 
     @property
     def content(self) -> bytes:
-        """The bytes of the file."""
         return self.path.read_bytes()
 
     def camera_json(self, **changed: Any) -> str:
-        """The camera, some of it changed."""
         names = ("model", "width", "height", "params")
         return json.dumps({name: getattr(self.camera, name) for name in names} | changed)
 
     def form(self, camera: str | None = None) -> dict[str, Any]:
-        """Return the form for httpx."""
         return {
             "files": {"image": ("photo.jpg", self.content, "image/jpeg")},
             "data": {"camera": self.camera_json() if camera is None else camera},

@@ -54,9 +54,6 @@ def pinhole(width: int, height: int, focal: float = 300.0) -> str:
     )
 
 
-# ------------------------------------------------------------------------------------- answers
-
-
 def test_answers_equal_the_localizer(
     client: TestClient, localizer: Localizer, photos: list[Photo]
 ) -> None:
@@ -152,9 +149,6 @@ def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
     assert seen["images"] == len(flat) == 7 and len(seen["points"]) > 200
 
 
-# ------------------------------------------------------------------------------------- refusals
-
-
 @pytest.mark.parametrize(
     "camera, words",
     [
@@ -238,10 +232,7 @@ def test_a_full_queue_refuses_images(
         return localize(query)
 
     monkeypatch.setattr(localizer, "localize_query", slow)
-    with (
-        client_of(localizer, threads=1, max_waiting=1) as client,
-        ThreadPoolExecutor(6) as pool,
-    ):
+    with client_of(localizer, threads=1, max_waiting=1) as client, ThreadPoolExecutor(6) as pool:
         sent = [pool.submit(client.post, "/localize", **photos[0].form()) for _ in range(6)]
         full = [future.result() for future in itertools.islice(as_completed(sent), 4)]
         for answer in full:

@@ -31,7 +31,6 @@ HEAD = (
 
 @pytest.fixture(scope="module")
 def port(localizer: Localizer) -> Iterator[int]:
-    """The port of a service in a thread of this process."""
     with bind("127.0.0.1", 0) as bound:
         app = make_app(Service(localizer, threads=1), map_overview(localizer.map))
         server = uvicorn.Server(uvicorn.Config(app, log_config=None))
@@ -95,7 +94,6 @@ def _obey_interrupts() -> None:
 
 @contextmanager
 def served(served_map: Path, temporary: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """``megloc serve`` in a process, and its URL."""
     process = subprocess.Popen(
         [MEGLOC, "serve", str(served_map), "--port", "0", *SMALL],
         stdout=subprocess.PIPE,
@@ -141,9 +139,6 @@ def test_the_page_runs_in_a_browser(port: int, tmp_path: Path) -> None:
     browser = ["chromium", "--headless=new", "--no-sandbox", "--disable-gpu", "--dump-dom"]
     quiet = ["--enable-logging=stderr", f"--user-data-dir={tmp_path}", "--virtual-time-budget=5000"]
     done = subprocess.run(
-        [*browser, *quiet, f"http://127.0.0.1:{port}/"],
-        capture_output=True,
-        text=True,
-        timeout=120,
+        [*browser, *quiet, f"http://127.0.0.1:{port}/"], capture_output=True, text=True, timeout=120
     )
     assert "<canvas" in done.stdout and "CONSOLE" not in done.stderr, done.stderr

@@ -62,8 +62,6 @@ QUERY_POSES = {
 
 @dataclass(frozen=True)
 class World:
-    """Folders of a small scene and its map."""
-
     root: Path
     map_poses: dict[str, RigidTransform]
     query_poses: dict[str, RigidTransform]
@@ -87,7 +85,6 @@ class World:
     def localized(
         self, pairs: list[ImagePair] | None = None, **options: Any
     ) -> list[Pose | Failure]:
-        """Localize the queries from stored matches."""
         work = options.pop("work", HERE)
         chosen = LocalizationOptions(**options)
         results = localize_from_matches(

@@ -22,11 +22,7 @@ from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, ImageVa
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.stages.guided_pyramid import (
-    PyramidMethod,
-    pyramid_mapping,
-    pyramid_queries,
-)
+from megloc_kapture.stages.guided_pyramid import PyramidMethod, pyramid_mapping, pyramid_queries
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
@@ -87,11 +83,9 @@ class Scene:
         return self.folder("mapping")
 
     def larger(self, name: str) -> KaptureFolder:
-        """Return the folder with the features that all variants added."""
         return KaptureFolder(self.root / name, features_dirs=[self.root / f"{name}_all"])
 
     def pairs(self, name: str) -> list[ImagePair]:
-        """Return the pairs of mapping images, or of queries and mapping images."""
         if name == "mapping":
             return [ImagePair(*pair, 1.0) for pair in combinations(MAP_IMAGES, 2)]
         queries = self.folder(name).read().image_names()
@@ -122,7 +116,6 @@ class Scene:
 
 
 def method(**more: Any) -> PyramidMethod:
-    """Return a pyramid method with upright features by default."""
     how = {"extractor": Upright(), "matcher": NearestNeighbours()}
     return PyramidMethod(**how | {"verification": TwoViewOptions(), "options": ALL} | more)
 
@@ -134,7 +127,6 @@ def write_images(
     turned: Collection[str],
     prefix: str = "",
 ) -> None:
-    """Write images of ``source``, some of them rotated, as a kapture folder."""
     data = KaptureData()
     for number, (image, pose) in enumerate(sorted(poses.items())):
         camera = source.read().camera_of(image)
@@ -176,7 +168,6 @@ def scene(images_only: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
-    """Return the share of queries that are localized by the upright map images."""
     truth = query.read().poses()
     pairs = [ImagePair(image, other, 1.0) for image in truth for other in MAP_IMAGES[:2]]
     types, options = ["upright-pyramid"], LocalizationOptions()

@@ -38,11 +38,7 @@ from megloc_kapture.stages.global_features import (
     write_vocabulary,
 )
 from megloc_kapture.stages.local_features import extract_local_features, mask_path, read_mask
-from megloc_kapture.stages.preprocessing import (
-    MaskOptions,
-    PreprocessingOptions,
-    preprocess_images,
-)
+from megloc_kapture.stages.preprocessing import MaskOptions, PreprocessingOptions, preprocess_images
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
 from tests.worlds import folder_bytes
@@ -345,8 +341,6 @@ def test_damaged_inputs_are_refused(small_kapture: Any, tmp_path: Path) -> None:
 
 
 class Inconsistent:
-    """An extractor that returns fewer descriptors than keypoints."""
-
     name = "inconsistent"
 
     def extract(self, image: Image, mask: NDArray[np.bool_] | None = None) -> LocalFeatures:
@@ -433,9 +427,6 @@ def test_wrong_vectors_of_a_plugin_are_refused() -> None:
         describe_images(Wrong(), [np.zeros((4, 4, 3), np.uint8)], ["a.png"])
 
 
-# ------------------------------------------------------------------------------------ global vlad
-
-
 VLAD = VladOptions(num_clusters=8)
 
 
@@ -443,7 +434,6 @@ PLACE = Path("global_features", "vlad_rootsift")
 
 
 def assert_described_by(root: Path, folders: list[KaptureFolder], options: VladOptions) -> None:
-    """Compare all vectors with those by the vocabulary in the same folder."""
     found = read_vocabulary(root / PLACE)
     assert found is not None
     vocabulary, settings = found

@@ -301,18 +301,15 @@ def write_wall(root: Path, *, unposed: Sequence[int] = ()) -> KaptureFolder:
 
 @pytest.fixture(scope="module")
 def wall(tmp_path_factory: pytest.TempPathFactory) -> KaptureFolder:
-    """The wall, read only."""
     return write_wall(tmp_path_factory.mktemp("wall") / "map")
 
 
 def rows_of(folder: KaptureFolder, points: Iterable[int] | None = None) -> set[tuple[float, ...]]:
-    """Return points of a map (default: all) as tuples of coordinates and colours."""
     stored = folder.points3d()
     return set(map(tuple, stored if points is None else stored[[*points]]))
 
 
 def contents(folder: KaptureFolder) -> dict[str, set[tuple[tuple[float, ...], str, int]]]:
-    """Return observations by type: the point with its colour, the image, the keypoint."""
     points = folder.points3d()
     return {
         name: {

@@ -45,7 +45,6 @@ IMAGES = ("left/0.png", "right/2.png", "right/4.png")
 
 @pytest.fixture(scope="module")
 def mapping(images_only: Any, tmp_path_factory: pytest.TempPathFactory) -> KaptureFolder:
-    """Three images with depth maps and features."""
     root = tmp_path_factory.mktemp("lifting")
     poses = {image: images_only.map_poses[image] for image in IMAGES}
     write_kapture(root / "mapping", poses, with_poses=True, with_depth=True)
@@ -195,7 +194,6 @@ def test_each_local_type_has_its_points(world: Any, write_features: Any, tmp_pat
 
 
 def observations_of(folder: KaptureFolder, name: str, offset: int = 0) -> list[Any]:
-    """Return the image names, points, image rows and keypoints of a type."""
     seen = folder.observations()[name]
     columns = seen.point_ids - offset, seen.image_ids, seen.keypoint_ids
     return [seen.image_names, *(column.tolist() for column in columns)]
@@ -226,7 +224,6 @@ def published(source: KaptureFolder, root: Path) -> KaptureFolder:
 
 
 def observed(folder: KaptureFolder) -> set[tuple[tuple[float, ...], str, tuple[float, ...]]]:
-    """Return the point, image and keypoint coordinates of every observation."""
     seen, points = folder.observations()[TYPE], folder.points3d()
     found = set()
     for row, image in enumerate(seen.image_names):

@@ -76,7 +76,6 @@ def folders(world: Any, write_features: Any, tmp_path: Path) -> Folders:
 
 
 def paired(folder: KaptureFolder, covisible: KaptureFolder | None = None, **options: Any) -> Any:
-    """Pairs of the map's images, by the options."""
     chosen = MappingPairsOptions.model_validate(options)
     return pair_map_images(folder, chosen, retrieval=BY_TOY, covisible=covisible)
 
@@ -211,7 +210,6 @@ PAIRS = [
 
 
 def write_matches(root: Path, counts: dict[tuple[str, str], tuple[int, int]], name: str) -> None:
-    """Write matches and the table of their counts (all, verified) by pair."""
     table = []
     writer = MatchesWriter(root, name, orphan=True)
     for (image, other), (found, verified) in counts.items():
@@ -222,7 +220,6 @@ def write_matches(root: Path, counts: dict[tuple[str, str], tuple[int, int]], na
 
 
 def run(root: Path, names: str, by: Any, keep: int) -> dict[str, list[tuple[str, int]]]:
-    """Return the images that each query keeps, with their counts."""
     query = KaptureFolder(root, features_dirs=[root])
     found = reranked(PAIRS, query, root, list(names), RerankingOptions(by=by, keep=keep))
     return {q: [(p.map, int(p.score)) for p in found if p.query == q] for q in ("q1", "q2")}

@@ -69,8 +69,6 @@ def test_queries_are_localized_accurately(world: Any) -> None:
 
 
 class Brightness:
-    """Ranks by the brightness of the query and reads the map images."""
-
     def score(self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene) -> np.ndarray:
         for hypothesis in hypotheses:
             first = hypothesis.images[0]
@@ -292,8 +290,6 @@ FRAMES = {"good": 1.0, "bad": 1e4}
 
 
 class Chosen(PoseRefinementOptions):
-    """Options with given refiners."""
-
     refiners: tuple[Any, ...] = ()
 
     def make_refiners(self, placement: Any = None) -> list[Any]:

@@ -169,8 +169,6 @@ def test_other_errors_are_not_retried(eight_at_once: None) -> None:
 
 
 class ManySift(RootSift):
-    """Extracts several images at once."""
-
     def __init__(self) -> None:
         super().__init__(RootSiftOptions(max_keypoints=300))
         self.seen: list[int] = []
@@ -183,9 +181,7 @@ class ManySift(RootSift):
 
 
 def test_one_thread_uses_the_gpu(
-    world: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folders = [world.mapping(), world.query()]
     images = sorted(world.map_poses)[:2]
@@ -212,9 +208,6 @@ def test_one_thread_uses_the_gpu(
     assert len(there.threads) == 1 and threading.get_ident() not in there.threads
 
 
-# ------------------------------------------------------------------------------------ options
-
-
 def test_networks_without_a_device_use_that_of_the_run() -> None:
     placement = NetworkOptions(device="cuda:1", half_precision=True)
     plain = load_plugin(MATCHERS, "nn", {"max_ratio": 0.9}, placement)  # without these options
@@ -228,9 +221,7 @@ def test_networks_without_a_device_use_that_of_the_run() -> None:
     assert stage.placement == placement
 
 
-def test_settings_depend_on_precision_not_on_the_device(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_settings_depend_on_precision_not_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = ExtractLocalFeatures, MatchQueries
     network = SimpleNamespace(options=SimpleNamespace(half_precision=False))
     for stage in stages:

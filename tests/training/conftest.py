@@ -35,7 +35,6 @@ def other_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one image."""
     root = tmp_path_factory.mktemp("photographs")
     write_image(root / "wall.jpg", render(POSES["2.png"]))
     return root
@@ -43,7 +42,6 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Random weights by name: superpoint, xfeat."""
     folder = tmp_path_factory.mktemp("weights")
     return {
         "superpoint": _random_file(folder / "superpoint_v1.safetensors", SuperPointNet(), 0),

@@ -117,11 +117,7 @@ def interrupted_after(step: int) -> Work:
 # of descriptors the matcher is a part
 @pytest.mark.slow
 def test_a_resumed_training_equals_an_uninterrupted_one(
-    files: dict[str, str],
-    walk: Path,
-    other_walk: Path,
-    photographs: Path,
-    tmp_path: Path,
+    files: dict[str, str], walk: Path, other_walk: Path, photographs: Path, tmp_path: Path
 ) -> None:
     chosen = options(files, DescriptorOptions, held_out_pairs=3)
     data = {

@@ -24,12 +24,7 @@ from aachen_files import (
 )
 from kapture import flatten
 from kapture.io.csv import kapture_from_dir
-from kapture_forms import (
-    aachen_with_kapture,
-    assert_linked,
-    assert_same_dataset,
-    without_images,
-)
+from kapture_forms import aachen_with_kapture, assert_linked, assert_same_dataset, without_images
 from kloc import kapture_tool
 from scipy.spatial.transform import Rotation
 
@@ -55,13 +50,11 @@ def edit(path: str, old: str, new: str) -> Callable[[Path], None]:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Version 1.0."""
     return write_v1_0(tmp_path / "Aachen-Day-Night")
 
 
 @pytest.fixture
 def root11(root: Path) -> Path:
-    """Version 1.1, in the same tree."""
     return write_v1_1(root)
 
 
@@ -287,7 +280,6 @@ def test_missing_parts_of_the_kapture_form_are_named(form_copy: Path) -> None:
 
 
 def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
-    """Return cameras and poses by image, as kapture reads them."""
     data = kapture_from_dir(str(folder))
     poses = data.trajectories or {}
     return {

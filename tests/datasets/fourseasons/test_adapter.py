@@ -140,9 +140,6 @@ def test_recordings_may_have_their_calibration(root: Path) -> None:
         FourSeasons().check(root)
 
 
-# ------------------------------------------------------------------ relocalization challenges
-
-
 def many_keyframes(root: Path, count: int) -> list[int]:
     times = [A + 50_000_000 * k for k in range(count)]
     write_recording(root, DAY, times, [f"{t},{k},0,0,0,0,0,1,1,2" for k, t in enumerate(times)])
@@ -243,9 +240,6 @@ def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
     write(root / "relocalizationFile_garage.txt", f"{A} 1\n")
     with pytest.raises(DataError, match="does not say which recording is the reference"):
         read(root)
-
-
-# ------------------------------------------------------------------ the published sample
 
 
 @pytest.fixture

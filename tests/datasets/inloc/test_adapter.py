@@ -37,7 +37,6 @@ def read(root: Path, *, allow_missing: bool = False, **options: object) -> Offic
 
 @pytest.fixture(scope="module")
 def output(downloaded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The download, imported with the default options."""
     return imported(downloaded, tmp_path_factory.mktemp("imported") / "out")
 
 

@@ -7,12 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kapture_forms import (
-    assert_linked,
-    assert_same_dataset,
-    robotcar_with_kapture,
-    without_images,
-)
+from kapture_forms import assert_linked, assert_same_dataset, robotcar_with_kapture, without_images
 from poses import error_vector, rigid
 from robotcar_files import CAMERAS, QUERIES, TEST, TRAIN, ts, write_layout
 
@@ -158,9 +153,6 @@ def test_additional_truth_is_joined_with_the_public_one(root: Path) -> None:
     # published poses take precedence
     center = truth.poses()[query_name(11)].center()
     np.testing.assert_allclose(center, [11.0, 5.0, -2.0], atol=1e-12)
-
-
-# ------------------------------------------------------------------ the rig of a model's poses
 
 
 RIG = {
