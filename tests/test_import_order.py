@@ -12,33 +12,6 @@ import sys
 
 import pytest
 
-ROUNDS = """
-import gzip, io, random, zlib
-import numpy as np
-data = random.Random(0).randbytes(300_000)
-for level in (1, 6, 9):
-    for _ in range(10):
-        assert zlib.decompress(zlib.compress(data, level)) == data
-        assert gzip.decompress(gzip.compress(data, level)) == data
-archive = io.BytesIO()
-np.savez_compressed(archive, a=np.arange(100_000))
-assert np.load(io.BytesIO(archive.getvalue()))["a"][-1] == 99_999
-print("whole")
-"""
-
-
-def run_python(code: str) -> subprocess.CompletedProcess[str]:
-    # a time limit because the corrupted heap sometimes hangs instead of aborting
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
-
-
-def test_heap_is_whole_after_imports() -> None:
-    done = run_python("import megloc_kapture, pycolmap, kapture.io.csv" + ROUNDS)
-    assert (done.returncode, done.stdout) == (0, "whole\n"), done.stderr
-
-
 # the packages of a fresh interpreter may hold zlib already: forget it, then write down what is
 # asked for while the package is imported
 FIRST_IMPORTS = """
@@ -56,6 +29,6 @@ print(*asked)
 
 @pytest.mark.parametrize("module", ["megloc_kapture", "megloc_kapture.io.colmap"])
 def test_package_imports_zlib_before_anything_else(module: str) -> None:
-    done = run_python(FIRST_IMPORTS.format(module=module))
-    assert done.returncode == 0, done.stderr
+    code = FIRST_IMPORTS.format(module=module)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split()[:2] == ["megloc_kapture", "zlib"]

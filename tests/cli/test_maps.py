@@ -15,13 +15,13 @@ import pytest
 from colmap_workspace import write_workspace
 from kapture.io.csv import kapture_from_dir
 
-from megloc_kapture.cli.main import main
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.dataset_tables import unit_of
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.service.server import map_overview
+from tests.pipeline.runs import run_command
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
@@ -36,25 +36,14 @@ def unposed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "photos").mkdir()
     for image in (scene / "mapping" / "sensors" / "records_data").iterdir():
         shutil.copyfile(image, root / "photos" / image.name)
-    with pytest.raises(SystemExit) as end:
-        main(["map", str(root / "photos"), "-o", str(root / "map"), *FEW])
-    assert end.value.code == 0
+    run_command("map", root / "photos", "-o", root / "map", *FEW)
     return root
 
 
 def test_a_second_run_keeps_the_map(megloc: Any, unposed: Path) -> None:
     done = megloc("map", unposed / "photos", "-o", unposed / "map", *FEW)
-    assert done.status == 0
-    assert done.out.splitlines() == [
-        f"map of 7 of 7 photographs: {unposed / 'map' / 'map'}",
-        "the map is in arbitrary units, not metres; --scale IMAGE IMAGE METRES sets the scale",
-    ]
+    assert done.out.startswith(f"map of 7 of 7 photographs: {unposed / 'map' / 'map'}\n")
     assert done.err.count("up to date") == 9
-
-
-def test_a_workspace_may_be_given_in_place_of_its_map(megloc: Any, unposed: Path) -> None:
-    workspace, map_folder = (megloc("info", unposed / name).out for name in ("map", "map/map"))
-    assert workspace.splitlines()[1:] == map_folder.splitlines()[1:] != []
 
 
 def test_positions_in_a_map_of_unknown_scale_are_in_units_of_the_map(
@@ -282,13 +271,11 @@ def test_a_model_of_poses_alone_without_images_is_imported_as_poses(
 
 @pytest.mark.slow
 def test_a_model_of_surveyed_photographs_is_localized_in(
-    megloc: Any, shared_data: Path, tmp_path: Path
+    megloc: Any, fountain: Path, tmp_path: Path
 ) -> None:
-    scene = shared_data / "scenes" / "fountain_p11"
-    write_workspace(tmp_path / "ws", scene)
-    done = megloc("import", "colmap", tmp_path / "ws", "-o", tmp_path / "map")
-    assert done.status == 0, done
-    places = ("-i", tmp_path / "map", "--query", scene / "query", "-o", tmp_path / "localized")
+    write_workspace(tmp_path / "ws", fountain)
+    run_command("import", "colmap", tmp_path / "ws", "-o", tmp_path / "map")
+    places = ("-i", tmp_path / "map", "--query", fountain / "query", "-o", tmp_path / "localized")
     done = megloc("localize", *places)
     assert "localized with sift" in done.err
-    check(tmp_path / "localized", scene)
+    check(tmp_path / "localized", fountain)

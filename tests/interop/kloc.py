@@ -49,10 +49,9 @@ def proxy(place: Path, sensors_of: Path, linked: dict[str, Path]) -> Path:
     return place
 
 
-def merged(place: Path, mapping: Path, query: Path, *, skip: Sequence[str] = ()) -> Path:
-    skipped = ["-s", *skip] if skip else []
+def merged(place: Path, mapping: Path, query: Path, *, skip: Sequence[str]) -> Path:
     images = ["--image_transfer", "link_absolute", "--keep-sensor-ids"]
-    kapture_tool("kapture_merge", "-i", mapping, query, "-o", place, *images, *skipped)
+    kapture_tool("kapture_merge", "-i", mapping, query, "-o", place, *images, "-s", *skip)
     return place
 
 

@@ -143,19 +143,13 @@ def images_of(scene: Path) -> list[Path]:
     return sorted(path for folder in folders for path in folder.rglob("*.jpg"))
 
 
-def with_exif(image: Path, *, focal_35mm: int | None = None, gps: Any = None) -> None:
+def add_gps(image: Path, latitude: float, longitude: float, altitude: float) -> None:
     exif = Image.Exif()
-    exif[0x010F], exif[0x0110] = "Maker", "Model"
-    if focal_35mm is not None:
-        exif.get_ifd(0x8769)[0xA405] = focal_35mm
-    if gps is not None:
-        table = exif.get_ifd(0x8825)
-        for at, value, names in ((1, gps[0], "NS"), (3, gps[1], "EW")):
-            seconds, whole = 3600 * abs(value), int(abs(value))
-            minutes = int(seconds / 60 - 60 * whole)
-            table[at] = names[0] if value >= 0 else names[1]
-            table[at + 1] = (float(whole), float(minutes), seconds - 3600 * whole - 60 * minutes)
-        table[5], table[6] = b"\x00", gps[2]
+    table = exif.get_ifd(0x8825)
+    for at, value, names in ((1, latitude, "NS"), (3, longitude, "EW")):
+        # degrees, minutes and seconds, of which any may have a fraction
+        table[at], table[at + 1] = names[value < 0], (abs(value), 0.0, 0.0)
+    table[5], table[6] = b"\x00", altitude
     Image.open(image).save(image, exif=exif, quality=95)
 
 
@@ -202,7 +196,7 @@ def test_gps_gives_scale_and_axes(
     rng = np.random.default_rng(0)
     for name, position in at.items():
         noisy = position + rng.normal(0, 0.3, 3) + (50.0 * (name == "0003.jpg"))
-        with_exif(photos / name, gps=geodetic(earth.apply(noisy[None])[0]))
+        add_gps(photos / name, *geodetic(earth.apply(noisy[None])[0]))
     found = megloc.map_photographs(photos, scale="gps", **FEW)
     assert found.kapture_map.folder.root == tmp_path / "runs/trip.2024-classic/map"
     assert found.kapture_map.unit == "m"
@@ -264,9 +258,10 @@ def test_a_map_is_described_with_the_photographs_it_lacks(room: Path, tmp_path: 
     assert (len(photographs.names), len(photographs.unreadable)) == (4, 1)
     missing = {"torn.jpg": "unreadable", photographs.names[0]: "too few matches"}
     write_unreadable(tmp_path / "megloc", missing, UNREGISTERED)
-    write_world(tmp_path / "megloc", World())
+    write_world(tmp_path / "megloc", World(unit="units"))
     lines = describe_map(tmp_path, photographs)
     assert lines[0].startswith("map of 3 of 5 photographs: ")
+    assert lines[-1].endswith("not metres; --scale IMAGE IMAGE METRES sets the scale")
     assert "not in the map: torn.jpg: unreadable" in lines
 
 

@@ -20,7 +20,6 @@ from megloc_kapture.geometry.cameras import with_two_focals
 from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.preprocessing import frames as module
 from megloc_kapture.preprocessing.frames import (
-    FramePlan,
     carry_points,
     cropped_size,
     fitted_size,
@@ -143,31 +142,6 @@ def cloudy() -> NDArray[np.uint8]:
     noise = np.random.default_rng(3).normal(size=(HEIGHT, WIDTH, 3))
     smooth = cv2.GaussianBlur(noise, (0, 0), 8.0)
     return np.clip(128 + 45 * smooth / smooth.std(), 0, 255).astype(np.uint8)
-
-
-def opencv_matrix(camera: Camera) -> NDArray[np.float64]:
-    """Calibration with the first pixel's centre at (0, 0), as OpenCV has it."""
-    fx, fy, cx, cy = camera.params[:4]
-    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
-
-
-def undistorted_by_opencv(image: NDArray[np.uint8], plan: FramePlan) -> NDArray[np.uint8]:
-    before, after = opencv_matrix(plan.original), opencv_matrix(plan.processed)
-    distortion = np.array(plan.original.params[4:])
-    size = (plan.processed.width, plan.processed.height)
-    if plan.original.model == "OPENCV_FISHEYE":
-        return cv2.fisheye.undistortImage(image, before, distortion, Knew=after, new_size=size)
-    maps = cv2.initUndistortRectifyMap(before, distortion, np.eye(3), after, size, cv2.CV_32FC1)
-    return cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
-def test_undistorted_images_equal_opencv(model: str) -> None:
-    image, plan = cloudy(), plan_frame(CAMERAS[model], **UNDISTORT)
-    expected = undistorted_by_opencv(image, plan).astype(int)
-    difference = np.abs(processed_image(image, plan) - expected)[3:-3, 3:-3]
-    assert difference.max() <= 4
-    assert difference.mean() < 0.6
 
 
 @pytest.mark.parametrize(

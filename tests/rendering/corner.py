@@ -77,6 +77,13 @@ def depth_m(cam_from_world: RigidTransform, camera: Camera = CAMERA) -> NDArray[
     return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
 
 
+def distance_to_walls(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distances in metres (N,) of points (N, 3) to the plane of the nearer wall."""
+    normals = [np.cross(along, [0.0, 1.0, 0.0]) for _, along, _, _ in WALLS]
+    distances = [np.abs((points - WALLS[k][0]) @ normal) for k, normal in enumerate(normals)]
+    return np.min(distances, axis=0)
+
+
 def pose_at(center: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> RigidTransform:
     rotation = Rotation.from_euler("xy", [pitch_deg, yaw_deg], degrees=True).as_matrix()
     return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))

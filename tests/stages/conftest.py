@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from corner import WALLS, pose_at, write_kapture
+from corner import pose_at, write_kapture
 from numpy.typing import NDArray
 
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
@@ -39,7 +39,7 @@ from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
-from megloc_kapture.stages.work import HERE
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 from tests.worlds import one_camera
 
@@ -82,16 +82,10 @@ class World:
     def query_pairs(self) -> list[ImagePair]:
         return pair_queries(self.mapping(), self.query(), QueryPairsOptions(), retrieval=BY_VLAD)
 
-    def localized(
-        self, pairs: list[ImagePair] | None = None, **options: Any
-    ) -> list[Pose | Failure]:
-        work = options.pop("work", HERE)
-        chosen = LocalizationOptions(**options)
-        results = localize_from_matches(
-            self.map(), self.with_matches("query"), pairs or self.query_pairs(),
-            ["rootsift"], chosen, work=work,
-        )  # fmt: skip
-        return list(results)
+    def localized(self, work: Work = HERE) -> list[Pose | Failure]:
+        query, pairs = self.with_matches("query"), self.query_pairs()
+        options, types = LocalizationOptions(), ["rootsift"]
+        return list(localize_from_matches(self.map(), query, pairs, types, options, work=work))
 
     def with_matches(self, kind: str) -> KaptureFolder:
         places = [self.features_dir, self.root / "matches" / kind]
@@ -144,20 +138,6 @@ def write_features() -> Callable[..., None]:
             writer.write(image, array)
 
     return write
-
-
-@pytest.fixture(scope="session")
-def distance_to_walls() -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Function: distances in metres of points (N, 3) to the plane of the nearer wall."""
-
-    def measure(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        distances = []
-        for origin, along, _, _ in WALLS:
-            normal = np.cross(along, [0.0, 1.0, 0.0])
-            distances.append(np.abs((points - origin) @ normal))
-        return np.asarray(np.min(distances, axis=0))
-
-    return measure
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from typing import Any
 import kapture.io.csv
 import numpy as np
 import pytest
-from corner import CAMERA, write_kapture
+from corner import CAMERA, distance_to_walls, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
@@ -54,7 +54,7 @@ def mapping(images_only: Any, tmp_path_factory: pytest.TempPathFactory) -> Kaptu
 
 
 def test_lifted_points_project_to_their_keypoints_and_lie_on_the_walls(
-    mapping: KaptureFolder, tmp_path: Path, distance_to_walls: Any
+    mapping: KaptureFolder, tmp_path: Path
 ) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     counts = lift_map(mapping, ["rootsift"], tmp_path)
