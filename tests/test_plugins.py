@@ -12,11 +12,10 @@ import pytest
 
 import megloc_kapture as megloc
 from megloc_kapture.errors import DataError, PluginError
-from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.plugin_loading import checked_array, load_plugin, plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages.local_features import _extract
-from megloc_kapture.values import ImageFeatures, LocalFeatures
+from megloc_kapture.values import LocalFeatures
 
 MODULE = """
     import numpy as np
@@ -131,11 +130,7 @@ def test_a_wrong_plugin_is_refused_by_name_with_the_reason(
     ("name", "options", "message"),
     [
         ("grid", {"step": "wide"}, r"'grid' rejects its options: .*step.* valid integer"),
-        (
-            "grid",
-            {"steps": 3},
-            r"'grid' rejects its options: unknown option 'steps'; did you mean 'step'",
-        ),
+        ("grid", {"steps": 3}, "'grid' rejects .* unknown option 'steps'; did you mean 'step'"),
         ("plain", {"step": 3}, r"'plain' rejects its options: it takes no options, got step"),
     ],
 )
@@ -151,12 +146,7 @@ def test_wrong_options_are_refused(
     [
         # of two packages
         (LOCAL_FEATURES, "grid", "rival:Grid", "registered twice.*outside_plugin:Grid.*rival:Grid"),
-        (
-            MATCHERS,
-            "crossed",
-            "megloc_kapture.features.rootsift:RootSift",
-            "does not implement Matcher: it lacks match",
-        ),
+        (MATCHERS, "crossed", "rival:Grid", "does not implement Matcher: it lacks match"),
     ],
     ids=["the same name", "no matcher"],
 )
@@ -213,7 +203,3 @@ def test_outputs_are_checked_from_python(outside: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(kind, "extract", reject)
     with pytest.raises(DataError, match=r"^a\.png: too small"):
         _extract(load_plugin(LOCAL_FEATURES, "grid"), [("a.png", Any)], [(image, None)])  # type: ignore[list-item]
-    monkeypatch.setattr(NearestNeighbours, "match", lambda *_: np.zeros((3, 2)))
-    features = ImageFeatures(np.zeros((1, 2), np.float32), np.zeros((1, 4)), 8, 8)
-    with pytest.raises(PluginError, match=r"got ndarray, expected \(matches, scores\)"):
-        megloc.match("nn", features, features)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from contextlib import redirect_stderr
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,35 +24,23 @@ OPTIONS = ("--set", "local_features.options.max_keypoints=800")
 INLINE = ("--executor", "inline")
 
 
-@dataclass(frozen=True)
-class Made:
-    features: Path
-    vlad: Path
-    mapping_pairs: Path
-    query_pairs: Path
-    mapping_matches: Path
-    query_matches: Path
-    map: Path
-
-
 @pytest.fixture(scope="module")
-def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
+def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Outputs of every stage up to the map and the matches of queries; read only."""
-    root = tmp_path_factory.mktemp("made")
-    made = Made(*(root / field.name for field in fields(Made)))
+    made = tmp_path_factory.mktemp("made")
     mapping, query = scene / "mapping", scene / "query"
-    local = ["--features-dir", made.features]
-    both = [*local, "--features-dir", made.vlad]
+    local = ["--features-dir", made / "features"]
+    both = [*local, "--features-dir", made / "vlad"]
     match = ["match", "-i", mapping, *local, *INLINE, "--pairs"]
-    triangulate = ["triangulate", "-i", mapping, *both, "--features-dir", made.mapping_matches]
+    triangulate = ["triangulate", "-i", mapping, *both, "--features-dir", made / "mapping_matches"]
     for command in (
-        ["extract-local", "-i", mapping, "-i", query, "-o", made.features, *OPTIONS, *INLINE],
-        ["extract-global", "-i", mapping, "--query", query, "-o", made.vlad, *local, *INLINE],
-        ["pairs-mapping", "-i", mapping, "-o", made.mapping_pairs, *both],
-        ["pairs-query", "-i", mapping, "--query", query, "-o", made.query_pairs, *both],
-        [*match, made.mapping_pairs, "-o", made.mapping_matches],
-        [*match, made.query_pairs, "--query", query, "-o", made.query_matches],
-        [*triangulate, "--pairs", made.mapping_pairs, "-o", made.map],
+        ["extract-local", "-i", mapping, "-i", query, "-o", made / "features", *OPTIONS, *INLINE],
+        ["extract-global", "-i", mapping, "--query", query, "-o", made / "vlad", *local, *INLINE],
+        ["pairs-mapping", "-i", mapping, "-o", made / "mapping_pairs", *both],
+        ["pairs-query", "-i", mapping, "--query", query, "-o", made / "query_pairs", *both],
+        [*match, made / "mapping_pairs", "-o", made / "mapping_matches"],
+        [*match, made / "query_pairs", "--query", query, "-o", made / "query_matches"],
+        [*triangulate, "--pairs", made / "mapping_pairs", "-o", made / "map"],
     ):
         with pytest.raises(SystemExit) as end, redirect_stderr(io.StringIO()) as err:
             main([*map(str, command), "--quiet"])
@@ -61,7 +48,7 @@ def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
     return made
 
 
-def test_single_stages_write_the_same_files_as_eval(made: Made, finished: Path) -> None:
+def test_single_stages_write_the_same_files_as_eval(made: Path, finished: Path) -> None:
     def without_marks(folder: Path) -> dict[str, bytes]:
         return {n: c for n, c in folder_bytes(folder).items() if not n.endswith(".megloc")}
 
@@ -70,26 +57,26 @@ def test_single_stages_write_the_same_files_as_eval(made: Made, finished: Path) 
     def part(*prefixes: str) -> dict[str, bytes]:
         return {n: c for n, c in expected.items() if n.startswith(prefixes)}
 
-    assert without_marks(made.features) == part("local_features/")
-    assert without_marks(made.vlad) == part("global_features/")
-    assert made.mapping_pairs.read_bytes() == expected["pairs/mapping.txt"]
-    assert made.query_pairs.read_bytes() == expected["pairs/query.txt"]
-    for place, name in ((made.mapping_matches, "mapping"), (made.query_matches, "query")):
+    assert without_marks(made / "features") == part("local_features/")
+    assert without_marks(made / "vlad") == part("global_features/")
+    assert (made / "mapping_pairs").read_bytes() == expected["pairs/mapping.txt"]
+    assert (made / "query_pairs").read_bytes() == expected["pairs/query.txt"]
+    for place, name in ((made / "mapping_matches", "mapping"), (made / "query_matches", "query")):
         prefix = f"matches/{name}/"
         actual = without_marks(place)
         assert actual and actual == {n.removeprefix(prefix): c for n, c in part(prefix).items()}
     for name in ("points3d.txt", "observations.txt"):
-        ours = (made.map / "reconstruction" / name).read_bytes()
+        ours = (made / "map" / "reconstruction" / name).read_bytes()
         assert ours == expected[f"map/reconstruction/{name}"]
 
 
 def test_the_map_of_single_stages_is_localized_in_evaluated_and_submitted(
-    megloc: Any, made: Made, scene: Path, tmp_path: Path
+    megloc: Any, made: Path, scene: Path, tmp_path: Path
 ) -> None:
     result = tmp_path / "localized"
     done = megloc(
-        *("localize", "-i", made.map, "--query", scene / "query", "-o", result),
-        *("--pairs", made.query_pairs, "--features-dir", made.features),
+        *("localize", "-i", made / "map", "--query", scene / "query", "-o", result),
+        *("--pairs", made / "query_pairs", "--features-dir", made / "features"),
     )
     assert done.out.startswith("4 of 4"), done
     report = tmp_path / "evaluation"
@@ -109,46 +96,33 @@ def test_the_map_of_single_stages_is_localized_in_evaluated_and_submitted(
 
 
 def test_reranked_pairs_and_their_matches_are_written(
-    megloc: Any, made: Made, scene: Path, tmp_path: Path
+    megloc: Any, made: Path, scene: Path, tmp_path: Path
 ) -> None:
     pairs, matches = tmp_path / "reranked.txt", tmp_path / "reranking"
-    folders = ("--features-dir", made.features, "--features-dir", made.vlad)
+    folders = ("--features-dir", made / "features", "--features-dir", made / "vlad")
     queries = ("-i", scene / "mapping", "--query", scene / "query", "-o", pairs)
     command = ("pairs-query", *queries, *folders, "--rerank", "2", "--rerank-by", "verified")
     assert megloc(*command, "--matches-dir", matches, *INLINE, "-q").status == 0
     counts = read_match_counts(matches, "rootsift").keys()
-    assert counts == {(pair.query, pair.map) for pair in read_pairs(made.query_pairs)}
+    assert counts == {(pair.query, pair.map) for pair in read_pairs(made / "query_pairs")}
     assert len(read_pairs(pairs)) == 2 * 4
     megloc(*command, "-f").refused("--rerank N needs --matches-dir DIR")
     megloc(*command, "--matches-dir", matches).refused(r"reranked\.txt: exists; -f")
 
 
 @pytest.mark.parametrize(
-    ("by", "message"),
+    ("by", "part", "message"),
     [
-        ("covisibility", "mapping: no map to pair images by co-visibility"),
-        ("retrieval", "no global_features; --features-dir FOLDER adds those in FOLDER/gl"),
+        ("covisibility", "mapping", "mapping: no map to pair images by co-visibility"),
+        ("retrieval", "mapping", "no global_features; --features-dir FOLDER adds those in FOLDER/"),
+        ("poses", "query", "query: pairs by poses: no image has a pose"),
     ],
 )
 def test_pairs_without_their_inputs_are_refused(
-    megloc: Any, finished: Path, tmp_path: Path, by: str, message: str
+    megloc: Any, finished: Path, tmp_path: Path, by: str, part: str, message: str
 ) -> None:
-    command = ("pairs-mapping", "-i", finished / "mapping", "-o", tmp_path / "pairs.txt", "--by")
-    megloc(*command, by).refused(message)
-
-
-def test_a_model_in_place_of_a_kapture_folder_is_named(megloc: Any, tmp_path: Path) -> None:
-    (tmp_path / "model" / "sparse").mkdir(parents=True)
-    (tmp_path / "model" / "sparse" / "points3D.bin").touch()
-    command = ("pairs-mapping", "-i", tmp_path / "model", "-o", tmp_path / "pairs.txt")
-    megloc(*command).refused("model: not a kapture folder; .*/sparse has a COLMAP model, from")
-
-
-def test_images_without_poses_cannot_be_paired_by_poses(
-    megloc: Any, scene: Path, tmp_path: Path
-) -> None:
-    command = ("pairs-mapping", "-i", scene / "query", "-o", tmp_path / "pairs.txt")
-    megloc(*command, "--by", "poses").refused("query: pairs by poses: no image has a pose")
+    command = ("pairs-mapping", "-i", finished / part, "-o", tmp_path / "pairs.txt")
+    megloc(*command, "--by", by).refused(message)
 
 
 def test_pairs_of_unknown_images_are_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
@@ -163,11 +137,11 @@ def test_pairs_of_unknown_images_are_refused(megloc: Any, finished: Path, tmp_pa
 
 
 def test_pairs_of_images_without_poses_need_a_two_view_verification(
-    megloc: Any, made: Made, scene: Path, tmp_path: Path
+    megloc: Any, made: Path, scene: Path, tmp_path: Path
 ) -> None:
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0001.jpg, 0004.jpg, 1.0\n")
-    command = ("match", "-i", scene / "query", "--features-dir", made.features, *INLINE)
+    command = ("match", "-i", scene / "query", "--features-dir", made / "features", *INLINE)
     command += ("--pairs", pairs, "-o", tmp_path / "matches")
     megloc(*command).refused(
         "1 of 1 pairs in .*pairs.txt have an image without a pose .* --query FOLDER"

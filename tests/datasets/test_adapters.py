@@ -18,7 +18,7 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DATASETS
 
-CUTOUTS = "database/cutouts"
+CUTOUTS, DUC2 = "database/cutouts", "database/alignments/DUC2"
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +49,7 @@ def without(layouts: Path, dataset: str, tmp_path: Path, *gone: str) -> Path:
         ("4seasons", [DAY, SNOW], "no recording here"),
         ("inloc", [f"{CUTOUTS}/DUC1", f"{CUTOUTS}/DUC2"], "none of DUC1, DUC2 exists"),
         ("inloc", ["query"], "query/iphone7/ is missing; the layout of InLoc is database"),
-        (
-            "inloc",
-            ["database/alignments"],
-            "database/alignments/ is missing; the layout of InLoc is",
-        ),
+        ("inloc", ["database/alignments"], "database/alignments/ is missing; the layout of InLoc"),
     ],
 )
 def test_a_folder_without_the_layout_is_refused(
@@ -68,19 +64,17 @@ def test_a_folder_without_the_layout_is_refused(
         adapter.check(tmp_path / "absent")
 
 
-@pytest.mark.parametrize("dataset", ["aachen", "robotcar", "4seasons"])
-def test_a_layout_one_folder_deeper_is_named(layouts: Path, tmp_path: Path, dataset: str) -> None:
-    shutil.copytree(layouts / dataset, tmp_path / "zip" / dataset)
-    adapter: Any = load_plugin(DATASETS, dataset, {})
+@pytest.mark.parametrize(
+    "given", ["aachen", "robotcar", "4seasons", "robotcar/images", f"4seasons/{DAY}"]
+)
+def test_a_layout_above_or_below_the_given_folder_is_named(
+    layouts: Path, tmp_path: Path, given: str
+) -> None:
+    dataset, _, inside = given.partition("/")
+    shutil.copytree(layouts / dataset, tmp_path / dataset)
+    root = tmp_path / given if inside else tmp_path
     with pytest.raises(DataError, match=f"there is one in .*{dataset}/: give it as the root"):
-        adapter.check(tmp_path / "zip")
-
-
-@pytest.mark.parametrize("inside", ["robotcar/images", f"4seasons/{DAY}"])
-def test_a_folder_inside_the_layout_names_the_layout(layouts: Path, inside: str) -> None:
-    dataset = inside.partition("/")[0]
-    with pytest.raises(DataError, match=f"there is one in .*{dataset}/: give it as the root"):
-        load_plugin(DATASETS, dataset, {}).check(layouts / inside)
+        load_plugin(DATASETS, dataset, {}).check(root)
 
 
 @pytest.mark.parametrize(
@@ -118,20 +112,10 @@ def test_an_archive_in_place_of_a_folder_is_named(layouts: Path, tmp_path: Path)
         ("robotcar", "images/night", "images/night/night", f"; {ts(13)}.jpg is at images/night/ni"),
         ("robotcar", "images/night", "images/nights", ""),
         ("robotcar", "images/night", "images/night.zip", "; is images/night.zip extracted[?]"),
-        (
-            "aachen",
-            "images_upright/db",
-            "images_upright/DB",
-            "; [0-9]+.jpg is at images_upright/DB/",
-        ),
-        (
-            "inloc",
-            "database/alignments/DUC2/transformations",
-            "database/alignments/DUC2",
-            "; DUC_trans_024.txt is at database/alignments/DUC2/",
-        ),
+        ("aachen", "images_upright/db", "images_upright/DB", "; [0-9]+.jpg is at images_upright/"),
+        ("inloc", f"{DUC2}/transformations", DUC2, f"; DUC_trans_024.txt is at {DUC2}/"),
         ("inloc", "query/iphone7", "query/iphone7/iphone7", ""),
-        ("inloc", "database/alignments/DUC2", "../gone", ""),  # DUC1's files have the same names
+        ("inloc", DUC2, "../gone", ""),  # DUC1's files have the same names
     ],
 )
 def test_the_place_of_missing_files_is_named(
@@ -165,7 +149,7 @@ def test_the_place_of_missing_files_is_named(
         ("robotcar", "3D-models/individual", "/queries_location_001.txt", 9, 0),
         ("inloc", f"{CUTOUTS}/DUC2", f"{CUTOUTS}/DUC2", 36, 3),
         ("inloc", f"{CUTOUTS}/DUC2/024", f"{CUTOUTS}/DUC2/<scans>", 36, 3),
-        ("inloc", "database/alignments/DUC2/transformations/DUC_trans_024.txt", "trans", 36, 3),
+        ("inloc", f"{DUC2}/transformations/DUC_trans_024.txt", "trans", 36, 3),
     ],
 )
 def test_missing_files_are_refused_or_skipped_on_request(
@@ -191,8 +175,5 @@ def test_missing_files_are_refused_or_skipped_on_request(
 
 def test_counts_are_compared_with_the_published_ones() -> None:
     lines = [str(Count("images", 3, published)) for published in (None, 3, 5)]
-    assert [line.split(maxsplit=2)[2:] for line in lines] == [
-        [],
-        ["as published"],
-        ["published: 5, -2"],
-    ]
+    ends = [line.split(maxsplit=2)[2:] for line in lines]
+    assert ends == [[], ["as published"], ["published: 5, -2"]]

@@ -136,35 +136,22 @@ def test_equal_names_of_map_and_queries_need_a_prefix(root: Path, tmp_path: Path
     assert imported.groups == {"a.png": night, "some/where/a.png": night}
 
 
-def test_a_map_without_poses_or_no_queries_are_refused(root: Path, tmp_path: Path) -> None:
-    for part, names, message in (
-        ("query", [], r"root/query: there are no query images"),
-        ("mapping", ["a.png"], r"root/mapping: no image has a pose"),
-    ):
-        shutil.rmtree(root / part)
-        write_part(root, part, names, poses=False)
-        with pytest.raises(DataError, match=message):
-            import_kapture_folders(root, tmp_path / "out")
-
-
-def test_truth_of_no_query_is_refused(root: Path, tmp_path: Path) -> None:
-    for names, poses, message in (
-        (
-            ["b/q.jpg", "r.jpg"],
-            True,
-            r"query_gt: none of its 2 .* 'b/q.jpg'\) is a query .* 'b/q.png'",
-        ),
-        (["b/q.png"], False, r"query_gt: no image has a pose: sensors/trajectories.txt is missing"),
-    ):
-        shutil.rmtree(root / "query_gt")
-        write_part(root, "query_gt", names, poses=poses, images=False)
-        with pytest.raises(DataError, match=message):
-            import_kapture_folders(root, tmp_path / "out")
-
-
-def test_queries_without_images_are_refused(root: Path, tmp_path: Path) -> None:
-    shutil.rmtree(root / "query/sensors/records_data")
-    with pytest.raises(DataError, match="root/query/sensors/records_data: no such folder"):
+@pytest.mark.parametrize(
+    ("part", "names", "poses", "message"),
+    [
+        ("mapping", ["a.png"], False, "root/mapping: no image has a pose"),
+        ("query", [], False, "root/query: there are no query images"),
+        ("query", ["b/q.png"], False, "root/query/sensors/records_data: no such folder"),
+        ("query_gt", ["b/q.jpg", "r.jpg"], True, "its 2 .* 'b/q.jpg', are not queries, .*b/q.png"),
+        ("query_gt", ["b/q.png"], False, "query_gt: no image has a pose: sensors/trajectories.txt"),
+    ],
+)
+def test_unusable_parts_are_refused(
+    root: Path, tmp_path: Path, part: str, names: list[str], poses: bool, message: str
+) -> None:
+    shutil.rmtree(root / part)
+    write_part(root, part, names, poses=poses, images=part == "mapping")
+    with pytest.raises(DataError, match=message):
         import_kapture_folders(root, tmp_path / "out")
 
 

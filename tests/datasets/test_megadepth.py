@@ -12,12 +12,12 @@ import pytest
 from corner import CAMERA, depth_m, pose_at, render
 from kapture.io.csv import kapture_from_dir
 
-from megloc_kapture.cli.main import main
 from megloc_kapture.datasets.megadepth import import_megadepth
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.scene import depth_records
+from tests.pipeline.runs import run_command
 
 h5py = pytest.importorskip("h5py")
 
@@ -99,9 +99,7 @@ def check(folder: Path) -> None:
 
 def test_a_scene_is_imported_by_its_undistorted_model(tmp_path: Path, capsys: Any) -> None:
     write_sample(tmp_path / "root", "0015", model=True)
-    with pytest.raises(SystemExit) as end:
-        main(["import", "megadepth", str(tmp_path / "root"), "-o", str(tmp_path / "out")])
-    assert end.value.code == 0, capsys.readouterr().err
+    run_command("import", "megadepth", tmp_path / "root", "-o", tmp_path / "out")
     printed = " ".join(capsys.readouterr().out.split())
     assert printed == "scene 1 images 4 without depth 2"
     check(tmp_path / "out" / "0015")

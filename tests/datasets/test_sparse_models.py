@@ -229,6 +229,13 @@ CAMERAS = "1 SIMPLE_RADIAL 1600 1067 1084.6 800 533.5 -0.0811\n"
 IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n\n8 1 0 0 0 0 0 0 1 db/8.jpg\n\n"
 
 
+def write_text(
+    root: Path, *, cameras: str = CAMERAS, images: str = IMAGES, points3D: str = ""
+) -> None:
+    for name, text in (("cameras", cameras), ("images", images), ("points3D", points3D)):
+        (root / f"{name}.txt").write_text(text, encoding="utf-8", newline="")
+
+
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
@@ -251,10 +258,8 @@ IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n\n8 1 0 0 0 0 0 0 1 db/8.jpg\n\n"
 def test_a_wrong_text_model_is_named(
     tmp_path: Path, name: str, old: str, new: str, message: str
 ) -> None:
-    texts = {"cameras": CAMERAS, "images": IMAGES, "points3D": ""}
-    texts[name] = texts[name].replace(old, new)
-    for file, text in texts.items():
-        (tmp_path / f"{file}.txt").write_text(text)
+    before = {"cameras": CAMERAS, "images": IMAGES, "points3D": ""}[name]
+    write_text(tmp_path, **{name: before.replace(old, new)})
     with pytest.raises(DataError, match=message) as caught:
         read_colmap_model(tmp_path)
     assert str(caught.value).startswith(str(tmp_path))
@@ -272,8 +277,7 @@ def test_a_wrong_text_model_is_named(
     ids=["no lines of features", "Windows", "blanks in names", "backslashes", "features"],
 )
 def test_images_of_other_tools_are_read(tmp_path: Path, change: Callable[[str], str]) -> None:
-    for file, text in (("cameras", CAMERAS), ("images", change(IMAGES)), ("points3D", "")):
-        (tmp_path / f"{file}.txt").write_text(text, encoding="utf-8", newline="")
+    write_text(tmp_path, images=change(IMAGES))
     names = [image.name for image in read_colmap_model(tmp_path).images]
     assert [name[-5:].removesuffix(".jpg")[-1] for name in names] == ["7", "8"]
     assert len({name.rpartition("/")[0] for name in names} & {"db", "my photos/day 1"}) == 1
@@ -281,8 +285,7 @@ def test_images_of_other_tools_are_read(tmp_path: Path, change: Callable[[str], 
 
 def test_image_sizes_and_ids_written_as_floats_are_read(tmp_path: Path) -> None:
     cameras, images = CAMERAS.replace("1600 1067", "1600.0 1067."), IMAGES.replace("7 1", "7.0 1")
-    for file, text in (("cameras", cameras), ("images", images), ("points3D", "")):
-        (tmp_path / f"{file}.txt").write_text(text)
+    write_text(tmp_path, cameras=cameras, images=images)
     model = read_colmap_model(tmp_path)
     assert [image.image_id for image in model.images] == [7, 8]
     (camera,) = model.cameras.values()
@@ -293,18 +296,14 @@ def test_image_sizes_and_ids_written_as_floats_are_read(tmp_path: Path) -> None:
 def test_points_of_missing_features_are_ignored(
     tmp_path: Path, track: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    points = f"1 0 0 5 1 2 3 0 {track}\n"
-    for file, text in (("cameras", CAMERAS), ("images", IMAGES), ("points3D", points)):
-        (tmp_path / f"{file}.txt").write_text(text)
+    write_text(tmp_path, points3D=f"1 0 0 5 1 2 3 0 {track}\n")
     model = read_colmap_model(tmp_path)
     assert len(model.images) == 2 and not len(model.points)
     assert "points3D.txt: ignored, as its tracks name images or features" in caplog.text
 
 
 def test_backslashes_in_binary_files_separate_folders(tmp_path: Path) -> None:
-    texts = {"cameras": CAMERAS, "images": IMAGES.replace("db/", "db\\"), "points3D": ""}
-    for file, text in texts.items():
-        (tmp_path / f"{file}.txt").write_text(text)
+    write_text(tmp_path, images=IMAGES.replace("db/", "db\\"))
     pycolmap.Reconstruction(tmp_path).write_binary(tmp_path)
     for text_file in tmp_path.glob("*.txt"):
         text_file.unlink()

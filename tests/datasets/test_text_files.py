@@ -104,13 +104,7 @@ def test_empty_and_binary_files_are_named(tmp_path: Path, reader: Reader) -> Non
         (read_nvm, "1000 1", "nan 1", None, "camera values are not finite"),
         (read_nvm, "1000 1", "1000 1.005", None, "camera 'db/7.jpg': .*not a unit quaternion"),
         (read_nvm, "db/7", "../7", None, "camera '../7.jpg': .*leads out"),
-        (
-            read_nvm,
-            "40\n",
-            "40\n1\nc.jpg 1 1 0 0 0 0 0 0 0 0\n1\n-7 8 9 0 0 0 0\n",
-            None,
-            "several models",
-        ),
+        (read_nvm, "40\n", "40\n1\nc.jpg 1 1 0 0 0 0 0 0 0 0\n1\n7 8 9 0 0 0 0\n", None, "several"),
     ],
 )
 def test_a_wrong_row_is_named(

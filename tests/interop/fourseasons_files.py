@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from aachen_files import put
 
 from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
 from megloc_kapture.datasets.official import OfficialDataset
@@ -31,16 +32,11 @@ TRANSFORMATIONS = """# transform_S_AS: translation vector, rotation quaternion
 ROWS = (f"{A},2,0,0,0,0,0,1,0.5,2", f"{B},2,4,0,0,0,0,1,0.25,2,0.5")
 
 
-def write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-
-
 def write_calibration(folder: Path, baseline: float = -0.3) -> None:
     pinhole = "Pinhole 5.0 5.0 4.25 1.75 0.0 0.0 0.0 0.0\n8 4\ncrop\n8 4\n"
-    write(folder / "undistorted_calib_0.txt", pinhole)
-    write(folder / "undistorted_calib_1.txt", pinhole)
-    write(
+    put(folder / "undistorted_calib_0.txt", pinhole)
+    put(folder / "undistorted_calib_1.txt", pinhole)
+    put(
         folder / "undistorted_calib_stereo.txt",
         f"1.0 0.0 0.0 {baseline}\n0.0 1.0 0.0 0.0\n0.0 0.0 1.0 0.0\n0.0 0.0 0.0 1.0\n",
     )
@@ -54,10 +50,10 @@ def write_recording(
         for camera in ("cam0", "cam1"):
             path = folder / f"undistorted_images/{camera}/{timestamp}.png"
             write_image(path, np.full((4, 8, 3), 9, np.uint8))
-    write(folder / "times.txt", "".join(f"{t} {t / 1e9:.10f} 0.25\n" for t in (*times, 17)))
+    put(folder / "times.txt", "".join(f"{t} {t / 1e9:.10f} 0.25\n" for t in (*times, 17)))
     if rows is not None:
-        write(folder / "GNSSPoses.txt", "# header\n" + "\n".join(rows) + "\n")
-        write(folder / "Transformations.txt", TRANSFORMATIONS)
+        put(folder / "GNSSPoses.txt", "# header\n" + "\n".join(rows) + "\n")
+        put(folder / "Transformations.txt", TRANSFORMATIONS)
     return folder
 
 

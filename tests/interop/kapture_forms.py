@@ -39,19 +39,17 @@ def aachen_with_kapture(official: Path, place: Path) -> Path:
     return place
 
 
-def robotcar_with_kapture(official: Path, place: Path, size_px: tuple[int, int]) -> Path:
-    """Import RobotCar as kapture's guide says; ``size_px`` is that of the images.
-
-    The importer takes every image to be 1024x1024, as the published ones are.
-    """
+def robotcar_with_kapture(official: Path, place: Path) -> Path:
+    """Import RobotCar as kapture's guide says; the importer assumes images of 1024x1024 pixels."""
     import_robotcar_seasons(
         str(official), str(place), False, TransferAction.link_absolute, skip_reconstruction=True
     )
     for part in place.glob("*/*"):
         data = kapture_from_dir(str(part))
         for name, camera in data.sensors.items():
-            params = [*size_px, *camera.camera_params[2:]]
-            data.sensors[name] = kapture.Camera(camera.camera_type, params)
+            data.sensors[name] = kapture.Camera(
+                camera.camera_type, [8, 6, *camera.camera_params[2:]]
+            )
         kapture_to_dir(str(part), data)
     return place
 

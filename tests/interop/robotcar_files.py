@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from aachen_files import put
 
 from megloc_kapture.io.images import write_image
 
@@ -14,11 +15,6 @@ CAMERAS = ("left", "rear", "right")
 
 def ts(number: int) -> int:
     return BASE + number
-
-
-def put(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
 
 
 # location of each time, and the lists of version 2

@@ -340,32 +340,30 @@ def test_damaged_inputs_are_refused(small_kapture: Any, tmp_path: Path) -> None:
     refused(r"a.png: the image is 160x120, its camera says 320x240", larger)
 
 
-class Inconsistent:
-    name = "inconsistent"
-
-    def extract(self, image: Image, mask: NDArray[np.bool_] | None = None) -> LocalFeatures:
-        keypoints_px, descriptors = np.ones((3, 2), np.float32), np.ones((2, 4), np.float32)
-        return LocalFeatures(keypoints_px, np.ones(3, np.float32), descriptors)
+OUTSIDE = "keypoints are not x, y within 160x120 pixels"
 
 
-def test_wrong_features_of_a_plugin_are_refused(small_kapture: Any, tmp_path: Path) -> None:
-    folder = small_kapture({"a.png": noise()})
-    message = r"'inconsistent' on image a\.png: .*got float32 \(2, 4\), expected .*3, N"
-    with pytest.raises(PluginError, match=message):
-        extract_local_features([folder], Inconsistent(), tmp_path / "features")
-
-
-@pytest.mark.parametrize("keypoint", [(20, 150), (-9, 5), (7,)], ids=["y, x", "negative", "x"])
-def test_keypoints_outside_of_the_image_are_refused(
-    small_kapture: Any, tmp_path: Path, keypoint: tuple[float, ...]
+@pytest.mark.parametrize(
+    ("keypoints", "descriptors", "message"),
+    [
+        ([(1, 1)] * 3, 2, r"got float32 \(2, 4\), expected .*3, N"),
+        ([(20, 150)], 1, OUTSIDE),  # y, x
+        ([(-9, 5)], 1, OUTSIDE),
+        ([(7,)], 1, OUTSIDE),
+    ],
+)
+def test_wrong_features_of_a_plugin_are_refused(
+    small_kapture: Any, tmp_path: Path, keypoints: Any, descriptors: int, message: str
 ) -> None:
-    class Mistaken(Inconsistent):
+    class Mistaken:
+        name = "mistaken"
+
         def extract(self, image: Image, mask: NDArray[np.bool_] | None = None) -> LocalFeatures:
-            one = np.ones(1, np.float32)
-            return LocalFeatures(np.array([keypoint], np.float32), one, one[:, None])
+            scores, values = np.ones(len(keypoints)), np.ones((descriptors, 4))
+            return LocalFeatures(*map(np.float32, (keypoints, scores, values)))
 
     folder = small_kapture({"a.png": noise()})
-    with pytest.raises(PluginError, match="keypoints are not x, y within 160x120 pixels"):
+    with pytest.raises(PluginError, match=rf"'mistaken' on image a\.png: .*{message}"):
         extract_local_features([folder], Mistaken(), tmp_path / "features")
 
 

@@ -247,8 +247,10 @@ SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
 class Shift:
     """Moves every pose by 0.25 along the optical axis, but not that of image ``stays``."""
 
-    def __init__(self, stays: str = "", name: str = "shift") -> None:
-        self.stays, self.name = stays, name
+    name = "shift"
+
+    def __init__(self, stays: str = "") -> None:
+        self.stays = stays
         self.asked: dict[str, list[str]] = {}
 
     def refine(
@@ -261,12 +263,6 @@ class Shift:
     ) -> Any:
         self.asked[query] = list(references)
         assert scene.query_image(query).shape[:2] == (camera.height, camera.width)
-        if self.name == "wrong":
-            return None
-        if self.name == "nan":
-            return PoseRefinement(RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, np.nan, 0.0)))
-        if self.name == "long":
-            return PoseRefinement(RigidTransform((1.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
         if query == self.stays:
             return PoseRefinement(cam_from_world, "nothing overlaps", {"overlap": 0.125})
         return PoseRefinement(SHIFT @ cam_from_world, measures={"overlap": 0.5})
@@ -275,8 +271,10 @@ class Shift:
 class Sure(Shift):
     """Moves poses in frames whose map is consistent; FRAMES has the inconsistency."""
 
+    name = "sure"
+
     def __init__(self, require_consistent_map: bool = True) -> None:
-        super().__init__(name="sure")
+        super().__init__()
         self.require_consistent_map = require_consistent_map
 
     def hold_out(self, image: str, images: Any, scene: Any) -> dict[str, float] | None:
@@ -370,16 +368,18 @@ def test_a_pose_is_refined_with_the_focal_length_that_was_estimated_with_it(
     assert status_table(tmp_path / "out").refinement[first] == "shift: accepted"
 
 
-def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_path: Path) -> None:
-    wrong = Chosen(refiners=(Shift(name="wrong"),))
-    with pytest.raises(PluginError, match="'wrong' on image .*: refine returned NoneType"):
-        refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
-    for name in ("nan", "long"):
-        wrong = Chosen(refiners=(Shift(name=name),))
-        with pytest.raises(
-            PluginError, match=f"'{name}' on image .*: refine returned an invalid pose: Rig"
-        ):
-            refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
+def test_wrong_refiners_are_refused(
+    world: Any, localized: KaptureFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders, options = (world.mapping(), world.query(), localized), Chosen(refiners=(Shift(),))
+    for answer, message in (
+        (None, "refine returned NoneType"),
+        (PoseRefinement(replace(SHIFT, translation=(0, np.nan, 0))), "no rotation and position"),
+        (PoseRefinement(replace(SHIFT, quat_wxyz=(1, 1, 0, 0))), "no rotation and position: Rig"),
+    ):
+        monkeypatch.setattr(Shift, "refine", lambda *_, answer=answer: answer)
+        with pytest.raises(PluginError, match=f"'shift' on image .*: {message}"):
+            refine_poses(*folders, tmp_path, options)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aachen_files import put
 from fourseasons_files import (
     DAY,
     RAIN,
@@ -21,7 +22,6 @@ from fourseasons_files import (
     pose_of,
     read,
     times_of,
-    write,
     write_calibration,
     write_recording,
     write_two_recordings,
@@ -71,15 +71,15 @@ def test_tables_have_the_groups_protocol_and_world_of_the_challenge(root: Path) 
 
 def test_all_frames_are_imported_on_request(root: Path) -> None:
     for camera in ("cam0", "cam1"):
-        write(root / image(DAY, B + 100, camera), "x")
-    write(root / DAY / "undistorted_images/cam0/preview.png", "x")
+        put(root / image(DAY, B + 100, camera), "x")
+    put(root / DAY / "undistorted_images/cam0/preview.png", "x")
     assert times_of(read(root).mapping) == {A, B}
     dataset = read(root, frames="all")
     assert times_of(dataset.mapping) == {A, B, B + 100}
     assert len(dataset.mapping.image_names()) == 6
     assert len(dataset.mapping.poses()) == 4
     # only those of relocalization pairs are scored
-    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
+    put(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {B + 5}\n")
     dataset = read(root, frames="all")
     assert times_of(dataset.query) == {A + 5, B + 5}
     scored = [name for name in dataset.query.image_names() if dataset.groups[name].scored]
@@ -105,21 +105,21 @@ def test_map_and_queries_are_recordings_by_name(root: Path) -> None:
 
 def test_keyframes_of_poor_fusion_are_skipped(root: Path) -> None:
     rows = (ROWS[0], ROWS[1].replace(",2,0.5", ",0,0.5"))
-    write(root / DAY / "GNSSPoses.txt", "\n".join(rows))
+    put(root / DAY / "GNSSPoses.txt", "\n".join(rows))
     dataset = read(root)
     assert times_of(dataset.mapping) == {A}
     assert "1 keyframes are left out" in dataset.remarks[0]
     assert times_of(read(root, min_fusion_quality=0).mapping) == {A, B}
-    write(root / DAY / "GNSSPoses.txt", rows[1])
+    put(root / DAY / "GNSSPoses.txt", rows[1])
     with pytest.raises(DataError, match="none of its 1 poses has a fusion quality of 1 or better"):
         read(root)
 
 
 def test_a_pose_without_scale_uses_the_scale_of_the_recording(root: Path) -> None:
-    write(root / DAY / "GNSSPoses.txt", f"{A},8,0,0,0,0,0,1\n{B},2,4,0,0,0,0,1,0.25,2")
+    put(root / DAY / "GNSSPoses.txt", f"{A},8,0,0,0,0,0,1\n{B},2,4,0,0,0,0,1,0.25,2")
     center = official(read(root), image(DAY, A)).center()
     np.testing.assert_allclose(center, (3999990.0, 800030.0, 4699981.0), atol=1e-8)
-    write(root / DAY / "Transformations.txt", TRANSFORMATIONS.partition("# GNSS")[0])
+    put(root / DAY / "Transformations.txt", TRANSFORMATIONS.partition("# GNSS")[0])
     with pytest.raises(DataError, match=r"GNSSPoses\.txt: neither the pose nor"):
         read(root)
     (root / DAY / "Transformations.txt").unlink()
@@ -140,12 +140,6 @@ def test_recordings_may_have_their_calibration(root: Path) -> None:
         FourSeasons().check(root)
 
 
-def many_keyframes(root: Path, count: int) -> list[int]:
-    times = [A + 50_000_000 * k for k in range(count)]
-    write_recording(root, DAY, times, [f"{t},{k},0,0,0,0,0,1,1,2" for k, t in enumerate(times)])
-    return times
-
-
 @pytest.mark.parametrize(
     ("day", "snow", "name"),
     [
@@ -158,12 +152,13 @@ def many_keyframes(root: Path, count: int) -> list[int]:
 def test_relocalization_files_select_images_and_priors(
     root: Path, tmp_path: Path, day: str, snow: str, name: str
 ) -> None:
-    times = many_keyframes(root, 50)
+    times = [A + 50_000_000 * k for k in range(50)]
+    write_recording(root, DAY, times, [f"{t},{k},0,0,0,0,0,1,1,2" for k, t in enumerate(times)])
     if day != DAY:
         (root / DAY).rename(root / day)
         (root / SNOW).rename(root / snow)
     write_recording(root, "a_drive_elsewhere", (5,), (f"5,{','.join(ROWS[0].split(',')[1:])}",))
-    write(root / name, f"{times[25]} {B + 5}\n{times[3]} {B + 5}\n")
+    put(root / name, f"{times[25]} {B + 5}\n{times[3]} {B + 5}\n")
     dataset = read(root)
     write_official(dataset, tmp_path / "out")
     written = tmp_path / "out/megloc"
@@ -194,9 +189,9 @@ def test_relocalization_files_select_images_and_priors(
 def test_pairs_of_2020_have_poses_relative_to_poses_txt(root: Path) -> None:
     (root / DAY / "GNSSPoses.txt").unlink()
     (root / DAY / "Transformations.txt").unlink()
-    write(root / DAY / "poses.txt", f"# ts t q\n{A} 100.5 7 3 0 0 0 1\n{B} 101.5 7 3 0 0 0.6 0.8\n")
+    put(root / DAY / "poses.txt", f"# ts t q\n{A} 100.5 7 3 0 0 0 1\n{B} 101.5 7 3 0 0 0.6 0.8\n")
     folder = root / DAY / "RelocalizationFilesVal"
-    write(folder / f"relocalizationFile_{SNOW}.txt", f"{A} {B + 5} 1 2 3 0 0 0.6 0.8\n")
+    put(folder / f"relocalizationFile_{SNOW}.txt", f"{A} {B + 5} 1 2 3 0 0 0.6 0.8\n")
     dataset = read(root)
     center = official(dataset, image(DAY, A)).center()
     np.testing.assert_allclose(center, [100.5, 7, 3], atol=1e-12)
@@ -211,13 +206,13 @@ def test_pairs_of_2020_have_poses_relative_to_poses_txt(root: Path) -> None:
 
 def test_the_pose_of_a_pair_takes_precedence_over_that_of_the_recording(root: Path) -> None:
     write_recording(root, RAIN, (A + 9,), (f"{A + 9},0,0,0,0,0,0,1,1,2",))
-    write(root / f"reloc_{DAY}_to_{RAIN}.txt", f"{A} {A + 9} 0 0 0 0 0 0 1\n")
+    put(root / f"reloc_{DAY}_to_{RAIN}.txt", f"{A} {A + 9} 0 0 0 0 0 0 1\n")
     dataset = read(root)
     assert pose_of(dataset, image(RAIN, A + 9)) == pose_of(dataset, image(DAY, A))
 
 
 def test_pairs_of_unknown_images_are_skipped(root: Path) -> None:
-    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n77 {B + 5}\n{A} 78\n")
+    put(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n77 {B + 5}\n{A} 78\n")
     dataset = read(root)
     assert [pair.query for pair in dataset.relocalization] == [image(SNOW, A + 5)]
     assert "2 pairs of relocalization files are left out" in dataset.remarks[0]
@@ -225,8 +220,8 @@ def test_pairs_of_unknown_images_are_skipped(root: Path) -> None:
 
 
 def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
-    write(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n")
-    write(root / f"reloc_{DAY}_to_garage.txt", f"{A} 1\n")
+    put(root / f"reloc_{DAY}_to_{SNOW}.txt", f"{A} {A + 5}\n")
+    put(root / f"reloc_{DAY}_to_garage.txt", f"{A} 1\n")
     assert missing_of(read(root)) == [root / "garage"]
     assert not missing_of(read(root, queries=SNOW))
     (root / DAY).rename(root / "renamed")
@@ -237,8 +232,8 @@ def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
     (root / "renamed").rename(root / DAY)
     shutil.rmtree(root / SNOW)
     assert missing_of(read(root)) == [root / "garage", root / SNOW]
-    write(root / "relocalizationFile_garage.txt", f"{A} 1\n")
-    with pytest.raises(DataError, match="does not say which recording is the reference"):
+    put(root / "relocalizationFile_garage.txt", f"{A} 1\n")
+    with pytest.raises(DataError, match="lacks the reference recording"):
         read(root)
 
 

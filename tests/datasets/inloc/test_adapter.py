@@ -25,9 +25,8 @@ def downloaded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_download(tmp_path_factory.mktemp("data") / "InLoc")
 
 
-def imported(root: Path, output: Path, *, allow_missing: bool = False, **options: object) -> Path:
-    dataset = read(root, allow_missing=allow_missing, **options)
-    write_official(dataset, output, allow_missing=allow_missing)
+def imported(root: Path, output: Path, **options: object) -> Path:
+    write_official(read(root, **options), output)
     return output
 
 
