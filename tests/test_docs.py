@@ -17,11 +17,11 @@ import pytest
 
 import megloc_kapture
 from megloc_kapture.cli.info import shown
-from megloc_kapture.cli.main import main
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.pipeline.presets import options_of
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.training.train import DescriptorOptions
+from tests.pipeline.runs import run_command
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")])
@@ -107,12 +107,6 @@ def test_files_of_the_repository_that_are_named_exist(page: Path) -> None:
             assert any((folder / name).is_file() for folder in folders), name
 
 
-def paper_rows() -> list[list[str]]:
-    text = (REPOSITORY / "docs" / "paper.md").read_text().split("## The paper's rules")[0]
-    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
-    return [row for row in rows if row[0] != "step"]
-
-
 def test_quotes_of_the_paper_are_its_words(shared_data: Path) -> None:
     def words(text: str) -> str:
         text = re.sub(r"~?\\cite\{[^}]*\}|\\cref\{para:global\}", "", text)
@@ -122,8 +116,9 @@ def test_quotes_of_the_paper_are_its_words(shared_data: Path) -> None:
     if not paper.is_file():
         pytest.skip("the paper's text is not at hand")
     text = words(paper.read_text())
-    for _, _, quotes, *_ in paper_rows():
-        for quote in re.findall(r'"([^"]+)"', quotes):
+    page = (REPOSITORY / "docs" / "paper.md").read_text().split("## The paper's rules")[0]
+    for row in re.findall(r"^\| (?!step \|).*", page, flags=re.M):
+        for quote in re.findall(r'"([^"]+)"', row.strip("| ").split(" | ")[2]):
             for part in re.split(r"\[[^\]]*\]", quote):
                 assert part.strip() in text, quote
 
@@ -136,9 +131,7 @@ def test_commands_have_their_options(capsys: pytest.CaptureFixture[str]) -> None
             command = words[:nested]
             name = " ".join(command)
             if name not in known:
-                with pytest.raises(SystemExit) as end:
-                    main([*command, "--help"])
-                assert end.value.code == 0, name
+                run_command(*command, "--help")
                 known[name] = capsys.readouterr().out
             for word in words[nested:]:
                 if re.match(r"--?[a-z]", word):
@@ -181,9 +174,7 @@ def test_the_stages_one_by_one(
         if any(word in absent for word in words):
             continue
         inline = [] if words[0] in ("info", "localize", "evaluate") else ["--executor", "inline"]
-        with pytest.raises(SystemExit) as end:
-            main([*words, *inline])
-        assert end.value.code == 0, (words, capsys.readouterr().err)
+        run_command(*words, *inline)
     assert "100.0 / 100.0 / 100.0 / 100.0" in capsys.readouterr().out
 
 
@@ -208,11 +199,8 @@ def test_the_plugins_of_the_tutorial(
     try:
         # the first command uses all plugins of the page
         (_, *words), *_ = commands(page)
-        with pytest.raises(SystemExit) as end:
-            main([*words, "--executor", "inline", "--workspace", "run"])
-        out, err = capsys.readouterr()
-        assert end.value.code == 0, err
-        assert "100.0 / 100.0 / 100.0 / 100.0" in out
+        run_command(*words, "--executor", "inline", "--workspace", "run")
+        assert "100.0 / 100.0 / 100.0 / 100.0" in capsys.readouterr().out
     finally:
         sys.modules.pop("my_plugins", None)
 

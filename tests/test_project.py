@@ -27,14 +27,10 @@ REQUIREMENTS = [
 ]
 
 
-def pins() -> dict[str, str]:
+def test_dependencies_are_pinned_inside_their_ranges() -> None:
     lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
     pairs = (line.split("==") for line in lines if line and not line.startswith("#"))
-    return {canonicalize_name(name): version for name, version in pairs}
-
-
-def test_dependencies_are_pinned_inside_their_ranges() -> None:
-    versions = pins()
+    versions = {canonicalize_name(name): version for name, version in pairs}
     for one in REQUIREMENTS:
         assert one.specifier.contains(versions[canonicalize_name(one.name)]), one.name
 

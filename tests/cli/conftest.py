@@ -12,6 +12,7 @@ import pytest
 
 from megloc_kapture.cli.main import main
 from tests.cli.foreign import write_foreign
+from tests.pipeline.runs import run_command
 
 # enough to localize all queries of the small scene
 SMALL = ("--set", "local_features.options.max_keypoints=800")
@@ -55,23 +56,21 @@ def megloc(capsys: pytest.CaptureFixture[str]) -> Command:
 def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Workspace of a finished run in this process; read only."""
     workspace = tmp_path_factory.mktemp("finished") / "workspace"
-    places = ["--root", str(scene), "--workspace", str(workspace)]
-    with pytest.raises(SystemExit) as end:
-        main(["eval", "kapture", *places, *SMALL, "--executor", "inline", "--quiet"])
-    assert end.value.code == 0
+    places = ("--root", scene, "--workspace", workspace)
+    run_command("eval", "kapture", *places, *SMALL, "--executor", "inline", "--quiet")
     return workspace
 
 
 @pytest.fixture
 def dataset(scene: Path, tmp_path: Path) -> Path:
     """A copy of the scene that a test may change."""
-    return copy_of(scene, tmp_path / "dataset")
+    return Path(shutil.copytree(scene, tmp_path / "dataset", symlinks=True))
 
 
 @pytest.fixture
 def workspace(finished: Path, tmp_path: Path) -> Path:
     """A copy of the finished workspace that a test may change."""
-    return copy_of(finished, tmp_path / "workspace")
+    return Path(shutil.copytree(finished, tmp_path / "workspace", symlinks=True))
 
 
 @pytest.fixture(scope="session")
@@ -85,9 +84,4 @@ def foreign_map(finished: Path, scene: Path, tmp_path_factory: pytest.TempPathFa
 @pytest.fixture
 def foreign(foreign_map: Path, tmp_path: Path) -> Path:
     """A copy of the foreign map, with links to its images."""
-    return copy_of(foreign_map, tmp_path / "foreign")
-
-
-def copy_of(folder: Path, place: Path) -> Path:
-    shutil.copytree(folder, place, symlinks=True)
-    return place
+    return Path(shutil.copytree(foreign_map, tmp_path / "foreign", symlinks=True))

@@ -41,9 +41,8 @@ def test_colmap_reads_an_exported_model(megloc: Any, finished: Path, tmp_path: P
     printed = megloc("export", "colmap", *sources(finished), "-o", tmp_path / "model").out
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
     truth = poses(finished / "map") | poses(finished / "localized")
-    assert printed.startswith(f"{len(truth)} images exported") and model.num_reg_images() == len(
-        truth
-    )
+    assert printed.startswith(f"{len(truth)} images exported")
+    assert model.num_reg_images() == len(truth)
     for image in model.images.values():
         rotation, centre = truth[image.name]
         world_from_cam = image.cam_from_world().inverse()
@@ -78,16 +77,8 @@ def test_tum_rows_and_ply_vertices_are_those_of_the_poses_and_points(
 def test_queries_without_poses_are_not_exported_silently(
     megloc: Any, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    done = megloc(
-        "export",
-        "ply",
-        "-i",
-        finished / "map",
-        "--query",
-        finished / "query",
-        "-o",
-        tmp_path / "a.ply",
-    )
+    places = ("-i", finished / "map", "--query", finished / "query", "-o", tmp_path / "a.ply")
+    done = megloc("export", "ply", *places)
     assert "/query: no query with a pose; give the output of `megloc localize`" in caplog.text
     assert done.status == 0 and (tmp_path / "a.ply").is_file()
 
@@ -138,11 +129,10 @@ def test_a_view_shows_a_map_a_result_and_its_errors(
     # an existing view is overwritten
     assert megloc("view", finished / "map", finished / "localized", "-o", out).status == 0
     statuses = read_status(finished / "localized/status.csv")
-    shown = {query["name"]: query for query in data_of(out)["queries"]}
-    assert shown.keys() == statuses.keys()
-    for name, status in statuses.items():
-        assert shown[name]["inliers"] == status.num_inliers and shown[name]["error"] is None
-        assert shown[name]["meaning"].startswith("confidence")
+    shown = {query["name"]: query["inliers"] for query in data_of(out)["queries"]}
+    assert shown == {name: status.num_inliers for name, status in statuses.items()}
+    described = {(query["error"], query["meaning"][:10]) for query in data_of(out)["queries"]}
+    assert described == {(None, "confidence")}
 
     truth = ("--gt", finished / "query_gt")
     assert megloc("view", finished / "map", finished / "localized", *truth, "-o", out).status == 0

@@ -12,17 +12,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from images import photograph
 from kapture.io.csv import kapture_from_dir
-from PIL import Image
 
 from megloc_kapture.cli.common import cameras_of_text
-from megloc_kapture.cli.main import main
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_pairs, write_sensors
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.values import Camera, RigidTransform
 from tests.cli.foreign import DESCRIPTORS, FOREIGN_MAPS, KEYPOINTS, rename_type
+from tests.pipeline.runs import run_command
 from tests.worlds import folder_bytes
 
 
@@ -193,20 +193,6 @@ def test_a_camera_may_be_longer_than_a_file_name() -> None:
 ORIENTATIONS = (1, 6)
 
 
-def photograph(source: Path, path: Path, *, orientation: int = 1, focal_35mm: int = 0) -> None:
-    """Write the image as a camera with square pixels stores it in this orientation."""
-    exif = Image.Exif()
-    exif[0x112] = orientation
-    if focal_35mm:
-        exif.get_ifd(0x8769)[0xA405] = focal_35mm
-    with Image.open(source) as image:
-        if image.size == (400, 300):  # the rendered room's, 300 px wide and 302 px high
-            image = image.resize((400, 298))
-        stored = image.transpose(Image.Transpose.ROTATE_90) if orientation == 6 else image
-        path.parent.mkdir(parents=True, exist_ok=True)
-        stored.save(path, exif=exif, quality=95)
-
-
 @pytest.fixture(scope="module")
 def localized(
     finished: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory
@@ -231,9 +217,8 @@ def localized(
             writer.write(cv2.resize(cv2.imread(str(query.image_path(name))), size))
     writer.release()
     places = ["-i", finished / "map", "--images", place, "-o", root / "out", "--every", "16"]
-    with pytest.raises(SystemExit) as end, redirect_stdout(io.StringIO()) as printed:
-        main(["localize", *map(str, places), "-q"])
-    assert end.value.code == 0
+    with redirect_stdout(io.StringIO()) as printed:
+        run_command("localize", *places, "-q")
     return root / "out", printed.getvalue()
 
 
@@ -266,13 +251,11 @@ def test_the_result_has_upright_images_with_their_estimated_cameras(
 
 
 @pytest.fixture(scope="module")
-def facade(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    scene = shared_data / "scenes" / "fountain_p11"
+def facade(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp("facade") / "workspace"
-    command = ["eval", "kapture", "--root", str(scene), "--workspace", str(workspace)]
-    with pytest.raises(SystemExit):
-        main([*command, "--until", "map", "--executor", "inline", "-q"])
-    return scene, workspace / "map"
+    places = ("--root", fountain, "--workspace", workspace)
+    run_command("eval", "kapture", *places, "--until", "map", "--executor", "inline", "-q")
+    return workspace / "map"
 
 
 # The focal length is 1381 px, 32.4 mm of 35 mm film; the images are without distortion, but their
@@ -280,18 +263,16 @@ def facade(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
 @pytest.mark.slow
 @pytest.mark.parametrize("focal_35mm", [0, 32, 42], ids=["no EXIF", "true EXIF", "30 % too long"])
 def test_real_photographs(
-    megloc: Any, facade: tuple[Path, Path], focal_35mm: int, tmp_path: Path
+    megloc: Any, fountain: Path, facade: Path, focal_35mm: int, tmp_path: Path
 ) -> None:
-    scene, kapture_map = facade
-    for path in (scene / "query").rglob("*.jpg"):
+    for path in (fountain / "query").rglob("*.jpg"):
         photograph(path, tmp_path / "photos" / path.name, focal_35mm=focal_35mm)
     out = tmp_path / "out"
-    done = megloc("localize", "-i", kapture_map, "--images", tmp_path / "photos", "-o", out)
+    done = megloc("localize", "-i", facade, "--images", tmp_path / "photos", "-o", out)
     assert done.status == 0
     data = KaptureFolder(out).read()
     assert data.poses().keys() == set(data.image_names())
     for name in data.image_names():
         assert data.camera_of(name).params[0] == pytest.approx(1381, rel=0.015)
-    row = evaluate(out, scene / "query_gt").row()
-    assert row.median_position_m is not None and row.median_angle_deg is not None
-    assert row.median_position_m < 0.07 and row.median_angle_deg < 0.15
+    _, median_m, median_deg = medians(out, fountain / "query_gt")
+    assert median_m < 0.07 and median_deg < 0.15

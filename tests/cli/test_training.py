@@ -16,11 +16,11 @@ from corner import pose_at, write_kapture, write_scene
 from kornia.feature import XFeat
 from safetensors.torch import load_file, save_file
 
-from megloc_kapture.cli.main import main
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.refinement import field_training
 from megloc_kapture.stages.scene import depth_records
+from tests.pipeline.runs import run_command
 
 SMALL = ("steps=2", "layers=2", "pairs_per_step=1", "max_keypoints=40", "max_size_px=200")
 
@@ -68,9 +68,7 @@ def mapping(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def field(mapping: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("field") / "field"
-    with pytest.raises(SystemExit) as end:
-        main(["train-field", "-i", str(mapping), "-o", str(out), *QUICK, "-q"])
-    assert end.value.code == 0
+    run_command("train-field", "-i", mapping, "-o", out, *QUICK, "-q")
     return out
 
 

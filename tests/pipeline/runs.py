@@ -1,13 +1,15 @@
-"""Runs of ``megloc eval`` from Python."""
+"""Runs of commands in this process, and of ``megloc eval`` from Python."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from megloc_kapture import Failure, Pose
+from megloc_kapture.cli.main import main
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -25,6 +27,13 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
+
+
+def run_command(*arguments: str | Path) -> None:
+    """Run ``megloc`` in this process; it must succeed."""
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    assert end.value.code == 0, arguments
 
 
 def run_in(
@@ -52,16 +61,14 @@ def evaluated(
     return workspace
 
 
-def run_twin(
-    workspace: Workspace, name: str, world: dict[str, Any], changes: Sequence[str] = ()
-) -> dict[str, StageReport]:
+def run_twin(workspace: Workspace, name: str, world: dict[str, Any]) -> dict[str, StageReport]:
     """Run a small twin of a dataset with its benchmark file, in two processes."""
     dataset = f"{TWIN_PREFIX}{name}"
     benchmark = find_benchmark(dataset)
     source = choose_dataset(dataset, None, import_options=benchmark.import_options)
     source = replace(source, twin=twin_of(name, **world))
     few = ["local_features.options.max_keypoints=1500", "global_features.options.num_clusters=32"]
-    options = options_of_preset(changes=[benchmark.options], assignments=[*few, *changes])
+    options = options_of_preset(changes=[benchmark.options], assignments=few)
     return run_in(workspace, source, options, workers=2, benchmark=benchmark)
 
 

@@ -10,7 +10,6 @@ import pytest
 from corner import write_scene
 
 from megloc_kapture import KaptureMap, Localizer, Pose
-from megloc_kapture.cli.main import main
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, read_pairs, write_sensors
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_match_counts, read_status
@@ -21,7 +20,7 @@ from megloc_kapture.stages.matches import SecondMatchingOptions, candidates_of, 
 from megloc_kapture.stages.paths import MAPPING_MATCHES, QUERY_MATCHES
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.values import RigidTransform
-from tests.pipeline.runs import evaluated
+from tests.pipeline.runs import evaluated, run_command
 
 TYPE = "rootsift"
 ALL_CANDIDATES = "localization.sure_confidence=none"  # as eval matches them
@@ -187,10 +186,8 @@ def test_the_command_writes_what_eval_writes(with_depth: Path, tmp_path: Path, b
     options = options_of_preset(assignments=sets)
     workspace = evaluated(tmp_path / "w", with_depth, options, last="submission")
     flags = [flag for one in sets for flag in ("--set", one)]
-    out, inputs = tmp_path / "localized", [str(workspace.path(name)) for name in ("map", "query")]
-    with pytest.raises(SystemExit) as end:
-        main(["localize", "-i", inputs[0], "--query", inputs[1], "-o", str(out), *flags])
-    assert end.value.code == 0
+    out, places = tmp_path / "localized", ("-i", workspace.path("map"))
+    run_command("localize", *places, "--query", workspace.path("query"), "-o", out, *flags)
     names = ["status.csv", "refinement.csv", "clusters.csv", "sensors/trajectories.txt"]
     tested = [place / CONSISTENCY_FILE for place in (out, workspace.path("localized"))]
     assert [path.is_file() for path in tested] == [by == "rendering"] * 2

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from poses import random_pose
 
 from megloc_kapture.cli.info import describe_sizes
 from megloc_kapture.errors import DataError, OutputError
@@ -46,12 +47,6 @@ def image(
         rows=NO_ROWS,
         points=NO_ROWS,
     )
-
-
-def centred_at(centre: tuple[float, float, float]) -> RigidTransform:
-    """Return the pose of a camera that looks north, its y axis down."""
-    world_from_cam = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    return RigidTransform.from_matrix(world_from_cam, np.array(centre)).inverse()
 
 
 @pytest.mark.parametrize(
@@ -144,9 +139,9 @@ def test_images_that_a_format_cannot_store_are_refused(tmp_path: Path) -> None:
 
 def test_corners_of_a_frustum_project_to_those_of_the_image() -> None:
     camera = Camera("OPENCV", 640, 480, (500, 510, 320, 240, -0.1, 0.01, 0.001, 0.002))
-    pose = centred_at((1.0, 2.0, 3.0))
+    pose = random_pose(np.random.default_rng(0))
     corners = frustum(camera, pose, 2.0)
-    np.testing.assert_allclose(corners[0], (1, 2, 3), atol=1e-12)
+    np.testing.assert_allclose(corners[0], pose.center(), atol=1e-12)
     np.testing.assert_allclose(pose.apply(corners[1:])[:, 2], 2.0)
     expected = [(0, 0), (640, 0), (640, 480), (0, 480)]
     np.testing.assert_allclose(project(camera, pose, corners[1:]), expected, atol=1e-6)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from megloc_kapture.cli.main import main
 from megloc_kapture.io.kapture import KaptureFolder
+from tests.pipeline.runs import run_command
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from whole_preset import (  # noqa: E402
@@ -59,9 +59,7 @@ STAGES = [
 
 
 def megloc(_: str, arguments: Sequence[str]) -> float:
-    with pytest.raises(SystemExit) as end:
-        main([*arguments, "--quiet"])
-    assert end.value.code == 0, arguments
+    run_command(*arguments, "--quiet")
     return 0.0
 
 

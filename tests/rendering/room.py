@@ -70,12 +70,9 @@ def render(
     light: int = 0,
     moving: int | None = None,
 ) -> RoomImage:
-    """Render the view of a camera; exact except for bilinear textures and rounding to 8 bit.
+    """Render a view; ``light`` is the one that shines, ``moving`` the seed of a sphere in the way.
 
-    Parameters
-    ----------
-    light : which of the two shines.
-    moving : seed of a sphere in the way; None: no sphere.
+    Exact except for bilinear textures and rounding to 8 bit.
     """
     fx, fy, cx, cy = camera.params
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import httpx2
@@ -88,10 +89,6 @@ MEGLOC = str(Path(sys.executable).with_name("megloc"))
 SMALL = ("--set", "local_features.options.max_keypoints=400")
 
 
-def _obey_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @contextmanager
 def served(served_map: Path, temporary: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     process = subprocess.Popen(
@@ -100,7 +97,7 @@ def served(served_map: Path, temporary: Path) -> Iterator[tuple[subprocess.Popen
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "TMPDIR": str(temporary)},
-        preexec_fn=_obey_interrupts,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
     try:
         assert process.stdout is not None
