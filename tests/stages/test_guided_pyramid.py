@@ -82,9 +82,6 @@ class Scene:
     def mapping(self) -> KaptureFolder:
         return self.folder("mapping")
 
-    def larger(self, name: str) -> KaptureFolder:
-        return KaptureFolder(self.root / name, features_dirs=[self.root / f"{name}_all"])
-
     def pairs(self, name: str) -> list[ImagePair]:
         if name == "mapping":
             return [ImagePair(*pair, 1.0) for pair in combinations(MAP_IMAGES, 2)]
@@ -181,7 +178,8 @@ def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
 
 
 def test_rotated_queries_gain_matches_and_are_localized(scene: Scene, tmp_path: Path) -> None:
-    mapping = scene.larger("mapping")
+    places = [scene.root / "mapping_all"]
+    mapping = KaptureFolder(scene.root / "mapping", features_dirs=places)
     with single_threaded():
         how, made = TriangulationOptions(), tmp_path / "map"
         with pytest.raises(DataError, match="no point could be triangulated"):

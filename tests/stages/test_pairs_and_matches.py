@@ -294,20 +294,16 @@ def all_pairs(first: list[str], second: list[str]) -> list[ImagePair]:
     return [ImagePair(a, b, 1.0) for a in first for b in second if a < b or second is not first]
 
 
-def matched(world: Any, kind: str, verification: Any, output: Path, **more: Any) -> dict[str, int]:
-    images, queries = sorted(world.map_poses), sorted(world.query_poses)
-    first = world.mapping() if kind == "mapping" else world.query()
-    pairs = all_pairs(images, images) if kind == "mapping" else all_pairs(queries, images)
+def match_queries(world: Any, verification: Any, output: Path) -> None:
+    folders, nearest = (world.query(), world.mapping()), NearestNeighbours()
+    pairs = all_pairs(sorted(world.query_poses), sorted(world.map_poses))
     with single_threaded():
-        return match_pairs(
-            first, world.mapping(), pairs, "rootsift", NearestNeighbours(), verification, output,
-            **more,
-        )  # fmt: skip
+        match_pairs(*folders, pairs, "rootsift", nearest, verification, output)
 
 
 def test_all_matches_or_verified_matches_are_stored(world: Any, tmp_path: Path) -> None:
-    matched(world, "query", None, tmp_path / "all")
-    matched(world, "query", TwoViewOptions(), tmp_path / "verified")
+    match_queries(world, None, tmp_path / "all")
+    match_queries(world, TwoViewOptions(), tmp_path / "verified")
     everything, verified = (
         world.mapping().with_features([tmp_path / name]).matches("rootsift")
         for name in ("all", "verified")

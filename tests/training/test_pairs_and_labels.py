@@ -34,9 +34,8 @@ from megloc_kapture.training.labels import (
 )
 from megloc_kapture.training.pairs import Photographs, PosedPairs, random_view
 from megloc_kapture.values import Camera, RigidTransform
+from tests.training.conftest import POSES
 
-# as conftest.py has them
-POSES = {f"{k}.png": pose_at((-2.4 + 0.8 * k, 0, 0), 24.0 - 12.0 * k, 0) for k in range(5)}
 SMALL = 200  # longer side, px
 
 
