@@ -90,7 +90,7 @@ class Plan:
                 (place.parent / temporary_name()).write_text("half")
             if self.options[name].get("fails"):
                 raise DataError("it fails")
-            return {"letters": float(len(text) + 1)}
+            return {"letters": np.float32(len(text) + 1)}  # type: ignore[dict-item]
 
         return run
 
@@ -165,15 +165,6 @@ def test_changed_stages_run_again(
     assert plan.result() == f"ab{plan.options['b'].get('extra', '')}c"
     plan.options["a"] = dict(reversed(plan.options["a"].items()))  # the order does not count
     assert all_kept(plan.run())
-
-
-def test_counts_may_be_numpy_numbers(tmp_path: Path) -> None:
-    counts: dict[str, Any] = {"letters": np.int64(2000), "mean_px": np.float32(0.5)}
-    stages = [Step("a", (), (), lambda out: counts)]
-    workspace = Workspace(tmp_path / "w")
-    (report,) = run_plan(stages, workspace)
-    assert describe(report).startswith("a: 2,000 letters, mean: 0.5 px; ")
-    assert all_kept(run_plan(stages, workspace))
 
 
 def test_an_output_of_another_stage_under_other_options_is_made_again(tmp_path: Path) -> None:
