@@ -233,7 +233,7 @@ def test_recordings_named_by_a_file_may_be_missing(root: Path) -> None:
     shutil.rmtree(root / SNOW)
     assert missing_of(read(root)) == [root / "garage", root / SNOW]
     put(root / "relocalizationFile_garage.txt", f"{A} 1\n")
-    with pytest.raises(DataError, match="lacks the reference recording"):
+    with pytest.raises(DataError, match="does not say which recording is the reference"):
         read(root)
 
 
