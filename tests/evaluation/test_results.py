@@ -26,6 +26,7 @@ from megloc_kapture.evaluation.results import (
     side_tables_near,
     workspace_of,
 )
+from megloc_kapture.io.colmap import new_colmap_pose
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
@@ -251,10 +252,8 @@ def test_colmap_models_are_truth_and_result(
     camera = pycolmap.Camera(model="PINHOLE", width=8, height=6, params=[5, 5, 4, 3], camera_id=1)
     model.add_camera_with_trivial_rig(camera)
     for number, (name, pose) in enumerate(world.truth.items(), start=1):
-        w, x, y, z = pose.quat_wxyz
-        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d([x, y, z, w]), np.array(pose.translation))
         image = pycolmap.Image(image_id=number, name=f"above/{name}", camera_id=1)
-        model.add_image_with_trivial_frame(image, rigid)
+        model.add_image_with_trivial_frame(image, new_colmap_pose(pose))
     (folder := tmp_path / "sparse" / "0").mkdir(parents=True)
     if kind in ("images.txt", "text"):
         model.write_text(str(folder))

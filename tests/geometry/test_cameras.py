@@ -99,13 +99,6 @@ def test_the_models_number_of_parameters_is_colmaps() -> None:
         assert not pycolmap.Camera(model=model, params=[0.0] * (count + 1)).verify_params()
 
 
-def colmap(given: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    theirs = pycolmap.Camera(
-        model=given.model, width=given.width, height=given.height, params=list(given.params)
-    )
-    return np.asarray(theirs.img_from_cam(points))
-
-
 def various_points() -> NDArray[np.float64]:
     """Return points in front of a camera: in its view, near its axis, and on its axis."""
     rng = np.random.default_rng(0)
@@ -117,13 +110,14 @@ def various_points() -> NDArray[np.float64]:
     return result
 
 
-def differences(given: Camera, at: NDArray[np.float64]) -> NDArray[np.float64]:
+def colmaps_derivatives(given: Camera, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return central differences of COLMAP's pixels with Richardson's extrapolation."""
 
     def central(step: float) -> NDArray[np.float64]:
         steps = step * at[:, 2:3]
         rows = [
-            (colmap(given, at + steps * axis) - colmap(given, at - steps * axis)) / (2 * steps)
+            (px_from_cam(given, at + steps * axis) - px_from_cam(given, at - steps * axis))
+            / (2 * steps)
             for axis in np.eye(3)
         ]
         return np.stack(rows, axis=2)
@@ -134,10 +128,11 @@ def differences(given: Camera, at: NDArray[np.float64]) -> NDArray[np.float64]:
 def assert_colmaps(given: Camera, at: NDArray[np.float64]) -> None:
     """Compare pixels and derivatives with COLMAP's."""
     pixels, jacobian = project_with_jacobian(given, at)
-    np.testing.assert_allclose(pixels, colmap(given, at), atol=1e-9, rtol=0)
+    np.testing.assert_allclose(pixels, px_from_cam(given, at), atol=1e-9, rtol=0)
     assert jacobian.shape == (len(at), 2, 3)
     scale = np.abs(jacobian).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(jacobian / scale, differences(given, at) / scale, atol=2e-8, rtol=0)
+    expected = colmaps_derivatives(given, at) / scale
+    np.testing.assert_allclose(jacobian / scale, expected, atol=2e-8, rtol=0)
 
 
 @pytest.mark.parametrize("model", CAMERA_MODEL_NUM_PARAMS)
@@ -149,7 +144,7 @@ def test_pixels_and_derivatives_are_colmaps(model: str) -> None:
 def test_the_field_of_view_model_at_its_expansions(omega: float) -> None:
     given, at = Camera("FOV", 640, 480, (F, 510.0, CX, CY, omega)), various_points()
     pixels, _ = project_with_jacobian(given, at)
-    np.testing.assert_allclose(pixels, colmap(given, at), atol=1e-9, rtol=0)
+    np.testing.assert_allclose(pixels, px_from_cam(given, at), atol=1e-9, rtol=0)
     # COLMAP's expansions are not continuous where they end
     radius = np.linalg.norm(at[:, :2] / at[:, 2:], axis=1)
     assert_colmaps(given, at[np.abs(radius - 0.01) > 1e-3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,19 +35,6 @@ def distance(files: tuple[Path, Path], **options: object) -> Any:
     return load_plugin(IMAGE_DISTANCES, "lpips", given)
 
 
-@cache
-def network(files: tuple[Path, Path]) -> Lpips:
-    net = Lpips("squeeze")
-    net.load_state_dict({k: v for f in files for k, v in torch.load(f, weights_only=True).items()})
-    return net
-
-
-def by_network(files: tuple[Path, Path], a: np.ndarray, b: np.ndarray, valid: np.ndarray) -> float:
-    tensors = [torch.from_numpy(x.transpose(2, 0, 1)[None] / 255.0).float() for x in (a, b)]
-    with torch.inference_mode():
-        return float(network(files)(*tensors, torch.from_numpy(valid)[None, None].float())[0])
-
-
 def pictures(count: int = 2, height: int = 80) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (count, height, 96, 3), dtype=np.uint8)
 
@@ -63,7 +49,11 @@ def test_the_distance_equals_the_networks(files: tuple[Path, Path]) -> None:
     a, b = pictures()
     valid = FULL.copy()
     valid[:, :30] = False
-    expected = by_network(files, a, b, valid)
+    net = Lpips("squeeze")
+    net.load_state_dict({k: v for f in files for k, v in torch.load(f, weights_only=True).items()})
+    tensors = [torch.from_numpy(x.transpose(2, 0, 1)[None] / 255.0).float() for x in (a, b)]
+    with torch.inference_mode():
+        expected = float(net(*tensors, torch.from_numpy(valid)[None, None].float())[0])
     assert expected > 0
     assert plugin.distance(a, b, valid) == pytest.approx(expected, rel=1e-5)
     assert plugin.distance(a, a, valid) == 0.0

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,49 +16,7 @@ from megloc_kapture.plugins import HypothesisView, PoseHypothesis
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
-MAX_ERROR_PX = 5.0
-
-
-class NoScene:
-    """Refuse everything: rankers by inliers use matches only."""
-
-    def __getattr__(self, name: str) -> object:
-        raise AssertionError(f"{name} was asked for")
-
-
-def view(
-    points_px: NDArray[np.float64],
-    errors_px: NDArray[np.float64],
-    cam_from_world: RigidTransform | None = None,
-    points_world: NDArray[np.float64] | None = None,
-) -> HypothesisView:
-    return HypothesisView(
-        name="q",
-        camera=CAMERA,
-        cam_from_world=cam_from_world or RigidTransform.identity(),
-        points_px=points_px,
-        points_world=np.zeros((len(points_px), 3)) if points_world is None else points_world,
-        errors_px=errors_px,
-        inliers=errors_px <= 10.0,
-    )
-
-
-def hypothesis(*views: HypothesisView) -> PoseHypothesis:
-    return PoseHypothesis(("m",), views, max_error_px=10.0)
-
-
-def everywhere(count: int) -> NDArray[np.float64]:
-    at = (np.arange(count) + 0.5) / count
-    return np.stack([640 * at, 480 * ((at * 7) % 1)], axis=1)
-
-
-def test_inliers_are_counted_over_all_views() -> None:
-    good, bad = np.array([1.0, 2.0, 20.0]), np.array([np.inf, 11.0, 3.0])
-    three = everywhere(3)
-    result = InlierCount().score(
-        [hypothesis(view(three, good)), hypothesis(view(three, good), view(three, bad))], NoScene()
-    )
-    assert result.tolist() == [2.0, 3.0]
+NO_SCENE: Any = None  # rankers by inliers use matches only
 
 
 def room(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -68,8 +29,18 @@ def standing(at_x: float, points: NDArray[np.float64]) -> PoseHypothesis:
     """Return a hypothesis in the room at ``at_x`` that sees points of the room's frame."""
     pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (-at_x, 0.0, 0.0))
     world = points + (at_x, 0.0, 0.0)
-    seen = view(project(CAMERA, pose, world), np.zeros(len(points)), pose, world)
-    return PoseHypothesis((f"room{at_x}",), (seen,), MAX_ERROR_PX)
+    errors, every = np.zeros(len(points)), np.ones(len(points), bool)
+    seen = HypothesisView("q", CAMERA, pose, project(CAMERA, pose, world), world, errors, every)
+    return PoseHypothesis((f"room{at_x}",), (seen,), max_error_px=5.0)
+
+
+def test_inliers_are_counted_over_all_views() -> None:
+    alone = standing(0.0, room(3))
+    (seen,) = alone.views
+    some = replace(seen, inliers=np.array([True, True, False]))
+    rig = replace(alone, views=(some, seen))
+    scores = InlierCount().score([replace(alone, views=(some,)), rig], NO_SCENE)
+    assert scores.tolist() == [2.0, 5.0]
 
 
 @pytest.fixture
@@ -86,12 +57,12 @@ def test_distinctive_inliers_beat_more_common_ones(
     right = standing(0.0, np.concatenate([walls[:70], poster]))
     wrong = [standing(7.0 * number, walls) for number in (1, 2, 3)]
     hypotheses = [*wrong, right]
-    assert np.argmax(InlierCount().score(hypotheses, NoScene())) == 0
-    scores = DistinctiveInliers().score(hypotheses, NoScene())
+    assert np.argmax(InlierCount().score(hypotheses, NO_SCENE)) == 0
+    scores = DistinctiveInliers().score(hypotheses, NO_SCENE)
     # 70 points are in four rooms, 30 in three; ten in one
     np.testing.assert_allclose(scores, [*[70 / 4 + 30 / 3] * 3, 70 / 4 + 10])
     monkeypatch.undo()
-    assert np.argmax(DistinctiveInliers().score(hypotheses, NoScene())) == 3
+    assert np.argmax(DistinctiveInliers().score(hypotheses, NO_SCENE)) == 3
 
 
 def test_a_place_counts_where_it_has_an_inlier_nearby(
@@ -100,10 +71,10 @@ def test_a_place_counts_where_it_has_an_inlier_nearby(
     walls = room(50)
     nearby = walls + (0.01, 0.0, 0.0)  # 1 to 2 px
     hypotheses = [standing(0.0, walls), standing(7.0, nearby)]
-    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses, NoScene()), 50.0)
+    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses, NO_SCENE), 50.0)
     monkeypatch.setattr(ranking, "_RADIUS", 0.01)
-    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses, NoScene()), 25.0)
-    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses[:1], NoScene()), [50.0])
+    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses, NO_SCENE), 25.0)
+    np.testing.assert_allclose(DistinctiveInliers().score(hypotheses[:1], NO_SCENE), [50.0])
 
 
 def test_two_clusters_of_one_place_do_not_count_against_each_other(exact: None) -> None:
@@ -111,5 +82,5 @@ def test_two_clusters_of_one_place_do_not_count_against_each_other(exact: None) 
     everything = np.concatenate([walls, poster])
     twice = [standing(0.0, everything), standing(0.001, everything)]
     other = standing(7.0, walls)
-    scores = DistinctiveInliers().score([*twice, other], NoScene())
+    scores = DistinctiveInliers().score([*twice, other], NO_SCENE)
     np.testing.assert_allclose(scores, [40 / 2 + 20, 40 / 2 + 20, 40 / 3])

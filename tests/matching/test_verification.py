@@ -11,6 +11,7 @@ from poses import rigid
 from scipy.optimize import least_squares
 
 from megloc_kapture.geometry.cameras import bearing_rays, project, px_from_cam
+from megloc_kapture.io.colmap import new_colmap_pose
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
@@ -64,10 +65,8 @@ def scene(
 
 
 def test_essential_matrix_is_colmaps() -> None:
-    turn = pycolmap.Rotation3d(B_FROM_A.rotation_matrix())
-    rigid = pycolmap.Rigid3d(turn, np.array(B_FROM_A.translation))
     ours = essential_matrix(B_FROM_A)
-    theirs = pycolmap.essential_matrix_from_pose(rigid)
+    theirs = pycolmap.essential_matrix_from_pose(new_colmap_pose(B_FROM_A))
     # COLMAP's has the translation at unit length
     np.testing.assert_allclose(
         ours / np.linalg.norm(ours), theirs / np.linalg.norm(theirs), atol=1e-14

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 from scored import evaluate_poses, upright_camera, write_kapture
 
@@ -22,6 +21,7 @@ from megloc_kapture.evaluation.report.queries import legend, shown_queries
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.view import render_view, view_data
+from megloc_kapture.io.colmap import colmap_camera
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.points import write_points3d
@@ -55,10 +55,7 @@ def decoded(text: str, kind: str) -> np.ndarray:
 def check_corners(camera: Camera, pose: RigidTransform, frustum: np.ndarray) -> None:
     """The corners of a frustum are the image's corners, projected by COLMAP."""
     in_cam = frustum[1:].astype(np.float64) @ pose.rotation_matrix().T
-    theirs = pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=camera.params
-    )
-    pixels = theirs.img_from_cam(in_cam)
+    pixels = colmap_camera(camera).img_from_cam(in_cam)
     w, h = camera.width, camera.height
     np.testing.assert_allclose(pixels, [[0, 0], [w, 0], [w, h], [0, h]], atol=2e-3)
 
