@@ -10,7 +10,7 @@ import kapture
 import kapture.io.csv
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from poses import random_pose
 from scored import displaced, evaluate_poses
 from tools.kapture_export_LTVL2020 import export_ltvl
 
@@ -23,11 +23,11 @@ from megloc_kapture.values import RigidTransform
 
 Poses = dict[str, RigidTransform]
 Figures = Callable[..., Any]
+Bins = list[tuple[float, float]]
 BINS = [(0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0)]
 
 
 def kapture_of(poses: Poses, images: list[str]) -> kapture.Kapture:
-    """A kapture of one camera, with all ``images`` recorded and ``poses`` as trajectories."""
     sensors = kapture.Sensors()
     sensors["camera0"] = kapture.Camera(
         kapture.CameraType.SIMPLE_PINHOLE, [640, 480, 500.0, 320.0, 240.0]
@@ -42,20 +42,13 @@ def kapture_of(poses: Poses, images: list[str]) -> kapture.Kapture:
     return kapture.Kapture(sensors=sensors, records_camera=records, trajectories=trajectories)
 
 
-def random_pose(rng: np.random.Generator) -> RigidTransform:
-    quat = Rotation.random(rng=rng).as_quat(scalar_first=True)
-    return RigidTransform(tuple(quat.tolist()), tuple((rng.normal(size=3) * 30).tolist()))
-
-
-def random_poses(
-    count: int, metres: float, degrees: float, *, missing: int = 0
-) -> tuple[Poses, Poses]:
+def random_poses(count: int, m: float, deg: float, *, missing: int = 0) -> tuple[Poses, Poses]:
     """Return estimated and true poses, with errors of about so many metres and degrees."""
     rng = np.random.default_rng(count + missing)
     truth = {f"q/{i:03d}.jpg": random_pose(rng) for i in range(count)}
     estimated = {
         name: displaced(
-            pose, rng.normal(size=3) * metres * 10 ** rng.normal(0, 0.5), rng.uniform(0, degrees)
+            pose, rng.normal(size=3) * m * 10 ** rng.normal(0, 0.5), rng.uniform(0, deg)
         )
         for name, pose in list(truth.items())[missing:]
     }
@@ -70,7 +63,7 @@ def figures_of_kapture() -> Figures:
         reason="the oracle: pip install --no-deps kapture-localization==1.1.10",
     )
 
-    def figures(estimated: Poses, truth: Poses, bins: list[tuple[float, float]]) -> Any:
+    def figures(estimated: Poses, truth: Poses, bins: Bins) -> Any:
         images = sorted(truth)
         results = evaluation.evaluate(
             kapture_of(estimated, images), kapture_of(truth, images), images
@@ -80,9 +73,7 @@ def figures_of_kapture() -> Figures:
     return figures
 
 
-def assert_equal_figures(
-    estimated: Poses, truth: Poses, bins: list[tuple[float, float]], oracle: Figures
-) -> None:
+def assert_equal_figures(estimated: Poses, truth: Poses, bins: Bins, oracle: Figures) -> None:
     statistics, results = oracle(estimated, truth, bins)
     result = evaluate_poses(estimated, truth, thresholds=thresholds_from_pairs(bins))
     row = result.row()
@@ -142,8 +133,9 @@ def test_equal_without_rotation(figures_of_kapture: Figures) -> None:
     # MLAD's thresholds: kapture leaves the rotation out where its bound is negative
     estimated, truth = random_poses(50, 0.2, 90.0, missing=4)
     _, results = figures_of_kapture(estimated, truth, BINS)
-    # thresholds that single queries meet exactly, to the last bit
-    bounds = [float(position_m) for _, position_m, _ in results if np.isfinite(position_m)][:8]
+    # thresholds that single queries just meet
+    errors = [float(position_m) for _, position_m, _ in results if np.isfinite(position_m)]
+    bounds = [(1 + 1e-9) * error for error in errors[:8]]
     statistics, _ = figures_of_kapture(estimated, truth, [(bound, -1.0) for bound in bounds])
     thresholds = thresholds_from_pairs((bound, None) for bound in bounds)
     row = evaluate_poses(estimated, truth, thresholds=thresholds).row()
@@ -153,16 +145,13 @@ def test_equal_without_rotation(figures_of_kapture: Figures) -> None:
 
 @pytest.fixture
 def localized(world: Any, tmp_path: Path) -> Path:
-    """A localized kapture folder, written by kapture."""
     folder = tmp_path / "localized"
     kapture.io.csv.kapture_to_dir(str(folder), kapture_of(world.estimated, list(world.truth)))
     return folder
 
 
 @pytest.mark.parametrize(("names", "full"), [("basename", False), ("full", True)])
-def test_kaptures_exporter_gives_the_same_poses(
-    names: Any, full: bool, localized: Path, tmp_path: Path
-) -> None:
+def test_equal_to_kaptures_export(names: Any, full: bool, localized: Path, tmp_path: Path) -> None:
     theirs_path, ours_path = tmp_path / "theirs.txt", tmp_path / "ours.txt"
     export_ltvl(str(localized), str(theirs_path), full, False, False, False)
     ours_path.write_text(format_pose_file(KaptureFolder(localized).read().poses(), names=names))
@@ -174,9 +163,7 @@ def test_kaptures_exporter_gives_the_same_poses(
     assert rotation_angles_deg(quats, their_quats).max() < 1e-10
 
 
-def test_folders_written_by_kapture_are_evaluated(
-    world: Any, localized: Path, tmp_path: Path
-) -> None:
+def test_folders_of_kapture_are_evaluated(world: Any, localized: Path, tmp_path: Path) -> None:
     truth = tmp_path / "query_gt"
     kapture.io.csv.kapture_to_dir(str(truth), kapture_of(world.truth, list(world.truth)))
     result = evaluate(localized, truth)

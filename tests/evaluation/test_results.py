@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from poses import random_pose
-from scipy.spatial.transform import Rotation
+from poses import WRONG_CONVENTIONS, random_pose
 from scored import write_kapture
 
-from megloc_kapture.errors import DataError, MeglocError
+from megloc_kapture.errors import DataError, MeglocError, OptionError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import format_pose_file
@@ -82,6 +81,24 @@ def test_conditions_from_folder_names() -> None:
     }
 
 
+def test_thresholds_of_the_challenges() -> None:
+    # papers: (0.25, 2) (0.5, 5) (5, 10) outdoors, (0.25, 0.5, 1 m; 10 deg) on InLoc, MLAD by metres
+    outdoors = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+    assert protocol_of("aachen").thresholds == outdoors
+    assert protocol_of("robotcar").thresholds == outdoors
+    assert protocol_of("inloc").thresholds == ((0.25, 10.0), (0.5, 10.0), (1.0, 10.0))
+    assert protocol_of("4seasons").thresholds == ((0.1, None), (0.2, None), (0.5, None))
+    assert protocol_of("4seasons").pose_file == "mlad"
+    assert protocol_of("kapture") == Protocol()
+    robotcar = protocol_of("robotcar")
+    pooled = [condition for parts in robotcar.pools.values() for condition in parts]
+    assert sorted(pooled) == sorted(robotcar.conditions)
+    assert robotcar.pools["night-all"] == ("night", "night-rain")
+    assert len(robotcar.pools["day-all"]) == 7
+    with pytest.raises(OptionError, match="known: aachen, robotcar, 4seasons, inloc"):
+        protocol_of("synthetic-cmu")
+
+
 def test_results_in_other_local_frames(world: Any, tmp_path: Path) -> None:
     truth_world = World(official_from_local=SimilarityTransform(translation=(100.0, 20.0, 3.0)))
     other_world = World(
@@ -109,9 +126,7 @@ def test_results_in_other_local_frames(world: Any, tmp_path: Path) -> None:
     assert np.median(wrong[0].errors.position_m) > 1.0
 
 
-def test_truth_in_the_official_frame(
-    world: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_truth_in_the_official_frame(world: Any, tmp_path: Path, caplog: Any) -> None:
     """As a dataset's owner has it, outside of any import."""
     similarity = SimilarityTransform(
         quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(4.1e6, 8.6e5, 4.7e6), scale=2.0
@@ -129,9 +144,7 @@ def test_truth_in_the_official_frame(
     assert "owner is in the dataset's official frame" in caplog.text
 
 
-def test_the_challenges_names_are_read_back(
-    world: Any, truth: Path, result: Path, tmp_path: Path
-) -> None:
+def test_listed_names_are_read_back(world: Any, truth: Path, result: Path, tmp_path: Path) -> None:
     names = {name: f"rear/{number}.png" for number, name in enumerate(sorted(world.truth))}
     listed = SideTables(protocol=protocol_of("robotcar"), names=names)
     write_side_tables(tmp_path / "megloc", listed)
@@ -169,9 +182,7 @@ def test_context_of_a_result(tmp_path: Path) -> None:
     assert nothing.query_images() == [] and nothing.queries is None
 
 
-def test_statuses_and_side_tables_are_used(
-    world: Any, result: Path, truth: Path, tmp_path: Path
-) -> None:
+def test_status_and_tables_are_used(world: Any, result: Path, truth: Path, tmp_path: Path) -> None:
     alone = evaluate(result, truth)
     assert [row.name for row in alone.rows] == ["all"] and len(alone.thresholds) == 4
     actual = read_result(result, SideTables())
@@ -243,9 +254,7 @@ def test_labels_do_not_decide_the_type_of_a_column(world: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", ["binary without points", "images.bin", "images.txt", "text"])
-def test_colmap_models_are_truth_and_result(
-    world: Any, truth: Path, tmp_path: Path, kind: str
-) -> None:
+def test_colmap_models_are_results_too(world: Any, truth: Path, tmp_path: Path, kind: str) -> None:
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -275,9 +284,7 @@ def test_unrelated_names_are_refused(world: Any, truth: Path, tmp_path: Path) ->
         evaluate({"a.jpg": np.eye(4)}, truth)  # type: ignore[dict-item]
 
 
-def test_results_that_name_the_queries_by_different_folders(
-    world: Any, truth: Path, result: Path, tmp_path: Path
-) -> None:
+def test_queries_may_lack_folders(world: Any, truth: Path, result: Path, tmp_path: Path) -> None:
     names = [f"seq/{name}" for name in world.truth]
     poses = {f"seq/{name}": pose for name, pose in world.estimated.items()}
     longer = write_kapture(tmp_path / "longer", names, poses)
@@ -291,9 +298,7 @@ def test_results_that_name_the_queries_by_different_folders(
     assert [evaluation.rows for evaluation in again] == [first.rows, first.rows]
 
 
-def test_a_result_with_poses_of_other_images_only_is_a_miss(
-    world: Any, truth: Path, tmp_path: Path
-) -> None:
+def test_a_result_with_other_poses_only_is_a_miss(world: Any, truth: Path, tmp_path: Path) -> None:
     other = {"left.jpg": RigidTransform.identity()}  # not evaluated, as RobotCar's side cameras
     folder = write_kapture(tmp_path / "localized", list(other), other)
     write_status(folder / "status.csv", [Failure("-", name=name) for name in world.truth])
@@ -301,9 +306,7 @@ def test_a_result_with_poses_of_other_images_only_is_a_miss(
     assert (row.num_queries, row.num_localized) == (len(world.truth), 0)
 
 
-def test_folders_without_usable_poses_are_refused(
-    result: Path, truth: Path, tmp_path: Path
-) -> None:
+def test_folders_of_no_usable_pose_are_refused(result: Path, truth: Path, tmp_path: Path) -> None:
     table = truth / "sensors" / "trajectories.txt"
     table.write_text(re.sub(r"(?m)^ *(\d+),", r"1000\1,", table.read_text()))
     for given in ((result, truth), (truth, result)):
@@ -331,16 +334,10 @@ def test_alignment() -> None:
 
 
 def test_another_convention_of_results_or_truth_is_named() -> None:
-    turns = Rotation.random(6, random_state=1)
-    centers = np.random.default_rng(1).normal(size=(6, 3))
-    true, given = dict[str, RigidTransform](), dict[str, RigidTransform]()
-    for n, (turn, center) in enumerate(zip(turns, centers, strict=True)):
-        x, y, z, w = turn.as_quat().tolist()
-        shift = tuple((-turn.apply(center)).tolist())
-        true[f"{n}.jpg"] = RigidTransform((w, x, y, z), shift)
-        given[f"{n}.jpg"] = RigidTransform((x, y, z, w), shift)
-    inverted = {name: pose.inverse() for name, pose in true.items()}
-    note = "0% of the poses fit the truth, but 100% with the results in another convention: poses "
-    assert evaluate(inverted, true).alignment.startswith(f"{note}inverted (camera-to-world")
-    assert "the results in another convention: quaternions" in evaluate(given, true).alignment
+    rng = np.random.default_rng(1)
+    true = {f"{n}.jpg": random_pose(rng) for n in range(6)}
+    for words, convert in WRONG_CONVENTIONS.items():
+        given = {name: convert(pose) for name, pose in true.items()}
+        note = f"but 100% with the results in another convention: {words}"
+        assert note in evaluate(given, true).alignment
     assert "true poses in another convention: quaternions" in evaluate(true, given).alignment

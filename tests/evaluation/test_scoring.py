@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from corner import pose_at
 from scipy.spatial.transform import Rotation
-from scored import evaluate_poses, pose_at, write_kapture
+from scored import evaluate_poses, evaluation_of, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate_results
@@ -32,9 +33,7 @@ HERE = RigidTransform.identity()
 
 
 def test_every_true_query_is_counted_once(world: Any) -> None:
-    evaluation = evaluate_poses(
-        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
-    )
+    evaluation = evaluation_of(world)
     assert [q.image for q in evaluation.queries] == sorted(world.truth)
     assert evaluation.errors.names == tuple(sorted(world.truth))
     row = evaluation.row()
@@ -128,34 +127,26 @@ def test_the_coarsest_threshold_need_not_be_given_last() -> None:
 
 
 MLAD = protocol_of("4seasons")
-FILE = "relocalizationFile_recording_a_to_recording_b.txt"
-Poses = dict[str, RigidTransform]
 
 
-def pairs_of(queries: list[str], reference: str = "ref/0.png") -> list[RelocalizationPair]:
-    return [RelocalizationPair(FILE, reference, query) for query in queries]
-
-
-def evaluate_all(
-    estimated: Poses, truth: Poses, references: Poses, pairs: list[RelocalizationPair]
-) -> Any:
-    result = Result("", estimated, tuple(estimated))
-    benchmark = SideTables(protocol=MLAD, relocalization=tuple(pairs))
-    return evaluate_pairs(result, truth, benchmark, references)
+def evaluate_query(estimated: RigidTransform, truth: RigidTransform) -> Any:
+    pairs = [RelocalizationPair("a_to_b.txt", "ref.png", "q.png")]
+    benchmark = SideTables(protocol=MLAD, relocalization=pairs)
+    result = Result("", {"q.png": estimated}, ("q.png",))
+    references = {"ref.png": pose_at([0.0, 0.0, 0.0], 33.0)}
+    return evaluate_pairs(result, {"q.png": truth}, benchmark, references)
 
 
 @pytest.mark.parametrize(("distance_m", "turn_deg"), [(3.0, 20.0), (50.0, 0.2)])
 def test_relative_errors_of_a_rotation_and_a_shift(distance_m: float, turn_deg: float) -> None:
     # right place, wrong heading: the reference is seen on a circle around the query
     at, turned = [distance_m, 0.0, 0.0], pose_at([distance_m, 0.0, 0.0], turn_deg)
-    references, pairs = {"ref/0.png": pose_at([0.0, 0.0, 0.0], 33.0)}, pairs_of(["q.png"])
-    actual = evaluate_all({"q.png": turned}, {"q.png": pose_at(at)}, references, pairs)
+    actual = evaluate_query(turned, pose_at(at))
     chord = 2 * distance_m * np.sin(np.deg2rad(turn_deg) / 2)
     assert actual.errors.position_m[0] == pytest.approx(chord, rel=1e-12)
     assert actual.by_center.errors.position_m[0] == pytest.approx(0.0, abs=1e-12)
     assert actual.errors.angle_deg[0] == pytest.approx(turn_deg)
-    shifted = {"q.png": pose_at([distance_m + 0.1, 0.0, 0.2], turn_deg)}
-    actual = evaluate_all(shifted, {"q.png": turned}, references, pairs)
+    actual = evaluate_query(pose_at([distance_m + 0.1, 0.0, 0.2], turn_deg), turned)
     for errors in (actual.errors, actual.by_center.errors):
         assert errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.io.images import write_depth_map, write_image
@@ -84,7 +84,7 @@ def distance_to_walls(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.min(distances, axis=0)
 
 
-def pose_at(center: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> RigidTransform:
+def pose_at(center: ArrayLike, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> RigidTransform:
     rotation = Rotation.from_euler("xy", [pitch_deg, yaw_deg], degrees=True).as_matrix()
     return RigidTransform.from_matrix(rotation, -rotation @ np.array(center))
 

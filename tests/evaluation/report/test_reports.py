@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scored import displaced, evaluate_poses, make_world, shifted
+from scored import displaced, evaluate_poses, evaluation_of, make_world, shifted
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.evaluation.comparison import compare
@@ -21,16 +21,9 @@ from megloc_kapture.evaluation.report.content import refinement_table
 from megloc_kapture.evaluation.report.queries import shown_queries, worst_queries
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.values import LocalizationResult, PoseRefinement, RigidTransform
 
 HERE = RigidTransform.identity()
-
-
-def evaluation_of(world: Any) -> Evaluation:
-    options = {"conditions": world.conditions, "statuses": world.statuses}
-    label = "a <b>bold</b> & daring result"
-    return evaluate_poses(world.estimated, world.truth, label=label, **options)
 
 
 def visible_text(page: str) -> str:
@@ -61,7 +54,8 @@ def test_names_are_escaped_and_the_steps_of_the_paper_come_first(world: Any) -> 
         {"name": "poses refined by ICP", "on": False, "why": "<no> depth"},
     ]
     provenance = {"root": f"/data/{evil}", "preset": "megloc", "steps": steps}
-    page = render_report(evaluation_of(world), provenance=provenance)
+    evaluation = evaluation_of(world, "a <b>bold</b> & daring result")
+    page = render_report(evaluation, provenance=provenance)
     assert not any(tag in page for tag in ("<script", "<i>day", "<b>bold"))
     text = visible_text(page)
     assert all(name in text for name in world.truth)
@@ -103,12 +97,9 @@ def test_files(world: Any, tmp_path: Path) -> None:
 def test_text_of_two_results(world: Any) -> None:
     day = sorted(name for name in world.estimated if world.conditions[name] == "day")
     fewer = {name: pose for name, pose in world.estimated.items() if name not in day[:8]}
-    options = {"conditions": world.conditions, "statuses": world.statuses}
     results = [
-        evaluate_poses(
-            world.estimated, world.truth, label=f"/data/{'x' * 40}/localized", **options
-        ),
-        evaluate_poses(fewer, world.truth, label="fewer", **options),
+        evaluation_of(world, f"/data/{'x' * 40}/localized"),
+        evaluation_of(replace(world, estimated=fewer), "fewer"),
     ]
     comparison = compare(results)
     (median,) = comparison.medians

@@ -1,4 +1,4 @@
-"""The 3D view: its data against the map, its frusta against COLMAP's cameras."""
+"""Views of a map: from above, and in 3D with its frusta against COLMAP's cameras."""
 
 from __future__ import annotations
 
@@ -6,26 +6,83 @@ import base64
 import html
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scored import evaluate_poses, upright_camera, write_kapture
+from scipy.spatial.transform import Rotation
+from scored import evaluate_poses, evaluation_of, shifted, upright_camera, write_kapture
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation import view as scenes
-from megloc_kapture.evaluation.report.queries import legend, shown_queries
+from megloc_kapture.evaluation.report.figures import views_from_above
+from megloc_kapture.evaluation.report.queries import legend, shown_queries, top_view
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
+from megloc_kapture.evaluation.scoring import QueryResult
 from megloc_kapture.evaluation.view import render_view, view_data
+from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.io.colmap import colmap_camera
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.points import write_points3d
 from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
+
+
+def arrays(poses: Iterable[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:
+    quats, translations = stack_poses(poses)
+    return quats, camera_centers(quats, translations)
+
+
+def turned(world: Any, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same cameras in a world turned by ``rotation``."""
+    turn = RigidTransform.from_matrix(rotation, np.zeros(3))
+    return arrays(pose @ turn.inverse() for pose in world.truth.values())
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1), (1, -1), (2, 1), (2, -1)])
+def test_top_view_along_any_axis_is_not_mirrored(world: Any, axis: int, sign: int) -> None:
+    up = np.zeros(3)
+    up[axis] = sign
+    rotation = Rotation.align_vectors(up[None], np.array([[0.0, 0, 1]]))[0].as_matrix()
+    page, labels = top_view(*turned(world, rotation))
+    np.testing.assert_allclose(np.cross(*page), up, atol=1e-12)
+    assert set(labels) == set("xyz") - {"xyz"[axis]}
+
+
+def test_top_view_of_a_slanted_world(world: Any) -> None:
+    level, labels = top_view(*arrays(world.truth.values()))
+    assert labels == ("x", "y")
+    np.testing.assert_array_equal(np.array([[1.0, 2.0, 3.0]]) @ level.T, [[1.0, 2.0]])
+    rotation = Rotation.from_euler("xyz", [40, 25, 10], degrees=True).as_matrix()
+    quats, centers = turned(world, rotation)
+    page, labels = top_view(quats, centers)
+    np.testing.assert_allclose(np.cross(*page), rotation[:, 2], atol=1e-9)
+    assert labels == ("along the map", "across the map")
+    # distances on the ground are kept
+    flat = centers @ page.T
+    ground = np.stack([pose.center()[:2] for pose in world.truth.values()])
+    np.testing.assert_allclose(
+        np.linalg.norm(flat - flat[0], axis=1), np.linalg.norm(ground - ground[0], axis=1)
+    )
+
+
+def test_frames_have_separate_figures() -> None:
+    mapped = {f"DUC1/{i}.jpg": shifted(i) for i in range(5)}
+    mapped |= {f"DUC2/{i}.jpg": shifted(1000.0 + i) for i in range(5)}
+    frames = {name: name[:4] for name in mapped}
+    truth = {"a.jpg": shifted(1.0), "b.jpg": shifted(1002.0), "c.jpg": shifted(1003.0)}
+    conditions = {"a.jpg": "DUC1", "b.jpg": "DUC2", "c.jpg": "DUC2"}
+    evaluation = evaluate_poses({"a.jpg": shifted(1.5)}, truth, conditions=conditions)
+    views = views_from_above(shown_queries(evaluation), mapped, frames, "m")
+    assert list(views) == ["DUC1", "DUC2"]
+    assert b"truth, no pose" in views["DUC2"] and b"truth, no pose" not in views["DUC1"]
+    # without frames there is one view, and without poses or truth none
+    assert list(views_from_above(shown_queries(evaluation), mapped, {}, "m")) == [""]
+    assert views_from_above([], mapped, {}, "m") == {}
+
 
 EVIL = "</script><script>alert('\"&')</script>\u2028<!--.jpg"
 CAMERAS = (
@@ -91,11 +148,6 @@ def drawn(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> Vi
 def page_of(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> str:
     data, notes = drawn(root, queries, **context)
     return render_view(EVIL, data, queries, notes)
-
-
-def evaluation_of(world: Any) -> Evaluation:
-    options = {"conditions": world.conditions, "statuses": world.statuses}
-    return evaluate_poses(world.estimated, world.truth, **options)
 
 
 @pytest.mark.parametrize(
@@ -182,8 +234,6 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
         ]  # fmt: skip
         expected = f"within {within[0]}" if within else f"beyond {evaluation.thresholds[-1]}"
         assert query["meaning"] == expected
-    errors = [np.inf if q["error"] is None else q["error"] for q in data["queries"]]
-    assert errors == sorted(errors, reverse=True)
     used = legend(list(shown))
     assert [m for _, m in used][-1] == "no pose" and len({c for c, _ in used}) == len(used)
 
