@@ -99,9 +99,7 @@ TABLES: dict[str, tuple[str, Callable[[Path], Any]]] = {
         ("relocalization.csv", "../../x.txt,a,b", ""),
     ],
 )
-def test_a_wrong_row_is_named_with_file_and_line(
-    tmp_path: Path, name: str, row: str, message: str
-) -> None:
+def test_a_wrong_row_has_file_and_line(tmp_path: Path, name: str, row: str, message: str) -> None:
     before, read = TABLES[name]
     (tmp_path / "sensors").mkdir()
     (tmp_path / "sensors/sensors.txt").write_text(SENSORS)
@@ -112,19 +110,66 @@ def test_a_wrong_row_is_named_with_file_and_line(
         read(tmp_path)
 
 
+def csv_table(path: Path) -> Any:
+    return list(read_csv_table(path, ("image", "reason")))
+
+
+def kapture_of(path: Path) -> Any:
+    return read_kapture_data(path.parents[1])
+
+
+def depth_map(path: Path) -> Any:
+    return read_depth_map(path, width=3, height=1)
+
+
+def points_with(row: str) -> str:
+    return VERSION + "1,2,3,4,5,6\n" * 20 + row + "\n1,2,3,4,5,6\n"
+
+
+def observations_with(row: str) -> str:
+    return VERSION + "0, t, a, 1, b, 2\n" * 20 + row + "\n3, t, a, 1\n"
+
+
+def sensors_of(version: str) -> str:
+    return SENSORS.replace(VERSION, "" if version == "none" else VERSION.replace("1.1", version))
+
+
+MILLIMETRES = np.array([[0, 1523, 8000.0]], "<f4").tobytes()
+
+
 @pytest.mark.parametrize(
-    ("head", "message"),
+    ("name", "content", "read", "message"),
     [
-        ("# kapture format: 1.2\n", "1.2 is not supported"),
-        ("# kapture format: 11.1\n", "11.1 is not supported"),
-        ("", "first line must be"),
+        ("sensors.txt", sensors_of("1.2"), kapture_of, r":1: .*1.2 is not supported"),
+        ("sensors.txt", sensors_of("11.1"), kapture_of, r":1: .*11.1 is not supported"),
+        ("sensors.txt", sensors_of("none"), kapture_of, ":1: .*first line must be"),
+        ("table.csv", "", csv_table, ":1: .*header"),
+        ("table.csv", "image\na\n", csv_table, ":1: .*header"),
+        ("table.csv", "image,reason,extra\na,b,c\n", csv_table, ":1: .*header"),
+        ("table.csv", b"image,reason\na,\xff\n", csv_table, ":2: .*UTF-8"),
+        ("points3d.txt", points_with("1,2,3,4,5"), read_points3d, "not a table of 3 or 6 columns"),
+        ("points3d.txt", points_with("1,2,3,4,5,"), read_points3d, "could not convert string ''"),
+        ("points3d.txt", points_with("1,2,3,4,5,nan"), read_points3d, "point 20 is not finite"),
+        ("o.txt", observations_with("5, t, a, 1, b"), read_observations, "expected point3d_id"),
+        ("o.txt", observations_with("x, t, a, 1"), read_observations, "expected point3d_id"),
+        ("o.txt", observations_with("5, a, 1, b, 2"), read_observations, "1.0 have no type"),
+        ("o.txt", observations_with("5, t, a, -1"), read_observations, "with ids of 0 or more"),
+        ("o.txt", observations_with(f"5, t, a, {2**31}"), read_observations, "ids of 0 or more"),
+        ("o.txt", observations_with("5, t/u, a, 1"), read_observations, "cannot be a type name"),
+        ("o.txt", observations_with("5, t, ../a, 1"), read_observations, "leads out"),
+        ("a.depth", bytes(8), depth_map, "8 bytes"),
+        ("a.depth", bytes(16), depth_map, "16 bytes"),
+        ("a.depth", MILLIMETRES, depth_map, "all values are whole .* millimetres; give met"),
     ],
 )
-def test_a_newer_or_missing_version_is_refused(tmp_path: Path, head: str, message: str) -> None:
-    (tmp_path / "sensors").mkdir()
-    (tmp_path / "sensors/sensors.txt").write_text(SENSORS.replace(VERSION, head))
-    with pytest.raises(DataError, match=rf"sensors\.txt:1: .*{message}"):
-        read_kapture_data(tmp_path)
+def test_a_wrong_file_is_named(
+    tmp_path: Path, name: str, content: str | bytes, read: Callable[[Path], Any], message: str
+) -> None:
+    path = tmp_path / "sensors" / name
+    path.parent.mkdir()
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(DataError, match=f"{re.escape(name)}.*{message}"):
+        read(path)
 
 
 def test_the_layout_of_kapture_1_0_names_the_remedy(tmp_path: Path) -> None:
@@ -139,56 +184,6 @@ def test_the_folder_of_a_type_names_the_folder_to_give(tmp_path: Path) -> None:
     (tmp_path / "global_features/global_features.txt").write_text(VERSION)
     with pytest.raises(DataError, match="that contains global_features/TYPE/global_features"):
         list_types(tmp_path, "global_features", orphan=True)
-
-
-@pytest.mark.parametrize("content", [b"", b"image\na\n", b"image,reason,extra\na,b,c\n"])
-def test_a_csv_table_with_another_header_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "table.csv"
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"table\.csv:1: .*header"):
-        list(read_csv_table(path, ("image", "reason")))
-
-
-def test_a_csv_table_in_another_encoding_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "table.csv"
-    path.write_bytes(b"image,reason\na,\xff\n")
-    with pytest.raises(DataError, match=r"table\.csv:2: .*UTF-8"):
-        list(read_csv_table(path, ("image", "reason")))
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ("1,2,3,4,5", "not a table of 3 or 6 columns"),
-        ("1,2,3,4,5,", "could not convert string ''"),
-        ("1,2,3,4,5,nan", "point 20 is not finite"),
-    ],
-)
-def test_wrong_points_are_named(tmp_path: Path, row: str, message: str) -> None:
-    path = tmp_path / "points3d.txt"
-    path.write_text(VERSION + "1,2,3,4,5,6\n" * 20 + row + "\n1,2,3,4,5,6\n")
-    with pytest.raises(DataError, match=rf"points3d\.txt:.*{message}"):
-        read_points3d(path)
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ("5, t, a, 1, b", "expected point3d_id"),
-        ("x, t, a, 1", "expected point3d_id"),
-        ("5, a, 1, b, 2", "files of kapture 1.0 have no type"),
-        ("5, t, a, -1", "with ids of 0 or more"),
-        (f"5, t, a, {2**31}", "with ids of 0 or more"),
-        ("5, t/u, a, 1", "cannot be a type name"),
-        ("5, t, ../a, 1", "leads out"),
-    ],
-)
-def test_wrong_observations_name_the_file(tmp_path: Path, row: str, message: str) -> None:
-    path = tmp_path / "observations.txt"
-    path.write_text(VERSION + "0, t, a, 1, b, 2\n" * 20 + row + "\n3, t, a, 1\n")
-    with pytest.raises(DataError, match=message) as caught:
-        read_observations(path)
-    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -218,27 +213,15 @@ def test_a_compressed_tar_is_refused(tmp_path: Path) -> None:
         open_folders([tmp_path], "keypoints")
 
 
-def test_a_depth_map_in_millimetres_is_named(tmp_path: Path) -> None:
-    np.array([[0, 1523, 8000.0]], "<f4").tofile(tmp_path / "d.depth")
-    with pytest.raises(DataError, match="d.depth: all values are whole .* millimetres; give met"):
-        read_depth_map(tmp_path / "d.depth", width=3, height=1)
+def test_one_fraction_makes_depth_metres_and_a_missing_map_is_named(tmp_path: Path) -> None:
     np.array([[0, 1.5, 8000.0]], "<f4").tofile(tmp_path / "d.depth")
-    assert read_depth_map(tmp_path / "d.depth", width=3, height=1).max() == 8000
-
-
-def test_a_depth_map_of_another_size_or_a_missing_one_is_named(tmp_path: Path) -> None:
-    (tmp_path / "a.depth").write_bytes(bytes(24))
-    for width, height in ((3, 3), (3, 1)):
-        with pytest.raises(DataError, match=r"a\.depth: 24 bytes"):
-            read_depth_map(tmp_path / "a.depth", width=width, height=height)
+    assert depth_map(tmp_path / "d.depth").max() == 8000
     with pytest.raises(DataError, match=r"b\.depth: cannot read: the file is missing"):
-        read_depth_map(tmp_path / "b.depth", width=3, height=2)
+        depth_map(tmp_path / "b.depth")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
-def test_truncated_images_are_named(
-    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_truncated_images_are_named(tmp_path: Path, suffix: str, capfd: Any) -> None:
     path = tmp_path / ("a" + suffix)
     pixels = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(path)

@@ -109,9 +109,7 @@ def test_refinements_read_back_by_image_with_their_steps_in_order(tmp_path: Path
 ROW = ConsistencyRow("DUC1", "rendering", 13, 2, 0.016, 0.25, 1.5, 0.024, 0.3, 11.5, "")
 
 
-def test_the_consistency_table_reads_back_with_empty_cells_for_unknown_values(
-    tmp_path: Path,
-) -> None:
+def test_the_consistency_table_reads_back_with_empty_unknown_values(tmp_path: Path) -> None:
     path = tmp_path / "map_consistency.csv"
     rows = [ROW, replace(ROW, frame="", reason="the depth maps, of one scan, disagree")]
     unknown = ConsistencyRow("", "rendering", 0, 0, *6 * [float("nan")], "no depth")

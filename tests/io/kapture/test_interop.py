@@ -12,6 +12,7 @@ import kapture.io.records
 import numpy as np
 import pytest
 from kapture.io.tar import TarHandler
+from poses import random_pose
 
 from megloc_kapture.io.images import read_depth_map, write_depth_map
 from megloc_kapture.io.kapture import (
@@ -39,11 +40,8 @@ INDICES = np.array([[0, 3], [4, 1]])
 SCORES = np.array([0.25, 1 / 3])
 
 
-def a_rotation(seed: int) -> RigidTransform:
-    rng = np.random.default_rng(seed)
-    quat = rng.normal(size=4)
-    quat /= np.linalg.norm(quat)
-    return RigidTransform(tuple(quat.tolist()), tuple(rng.normal(0, 1e6, 3).tolist()))
+def pose_of(seed: int) -> RigidTransform:
+    return random_pose(np.random.default_rng(seed))
 
 
 def our_data() -> KaptureData:
@@ -59,8 +57,8 @@ def our_data() -> KaptureData:
             "deep": Sensor.from_camera(depth, sensor_type="depth"),
             "gps": Sensor("", "gnss", ("EPSG:4326",)),
         },
-        rigs={"rig": {"cam0": a_rotation(0), "cam1": a_rotation(1)}, "car": {"rig": a_rotation(2)}},
-        trajectories={(TIME, "rig"): a_rotation(3), (TIME + 1, "cam1"): a_rotation(4)},
+        rigs={"rig": {"cam0": pose_of(0), "cam1": pose_of(1)}, "car": {"rig": pose_of(2)}},
+        trajectories={(TIME, "rig"): pose_of(3), (TIME + 1, "cam1"): pose_of(4)},
         records_camera=dict(
             zip([(TIME, "cam0"), (TIME, "cam1"), (TIME + 1, "cam1")], IMAGES, strict=True)
         ),
@@ -69,7 +67,6 @@ def our_data() -> KaptureData:
 
 
 def raw(pose: kapture.PoseTransform) -> RigidTransform:
-    """A pose of kapture's as it holds it."""
     return RigidTransform(tuple(pose.r_raw), tuple(pose.t_raw))
 
 
@@ -111,20 +108,16 @@ IDS = np.array([[0, 0, 3], [2, 0, 1], [4, 0, 2]], dtype=np.int32)  # points, ima
 OBSERVATIONS = Observations(IMAGES, IDS[0].astype(np.int64), *IDS[1:])
 
 
-def write_ours(root: Path) -> None:
-    write_sensors(root, our_data())
+def test_kapture_reads_our_files(tmp_path: Path) -> None:
+    write_sensors(tmp_path, our_data())
     for kind, by_image in arrays().items():
-        writer = FeatureWriter(root, kind, "T", CONFIGS[kind])  # type: ignore[arg-type]
+        writer = FeatureWriter(tmp_path, kind, "T", CONFIGS[kind])  # type: ignore[arg-type]
         for image, array in by_image.items():
             writer.write(image, array)
-    matches = MatchesWriter(root, "T")
+    matches = MatchesWriter(tmp_path, "T")
     matches.write(IMAGES[1], IMAGES[0], INDICES, SCORES)
-    write_points3d(root, POINTS)
-    write_observations(root, {"T": OBSERVATIONS})
-
-
-def test_kapture_reads_our_files(tmp_path: Path) -> None:
-    write_ours(tmp_path)
+    write_points3d(tmp_path, POINTS)
+    write_observations(tmp_path, {"T": OBSERVATIONS})
     with kapture.io.csv.get_all_tar_handlers(str(tmp_path)) as tars:
         theirs = kapture.io.csv.kapture_from_dir(str(tmp_path), tar_handlers=tars)
         assert_same_sensors(theirs, our_data())
@@ -199,9 +192,7 @@ def write_theirs(root: Path, *, tar: bool) -> None:
 
 
 @pytest.mark.parametrize("tar", [False, True])
-def test_we_read_files_of_kapture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tar: bool
-) -> None:
+def test_we_read_kaptures_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tar: bool) -> None:
     # observations are read in blocks, here of a row
     monkeypatch.setattr(points, "_BLOCK_CHARACTERS", 10)
     write_theirs(tmp_path, tar=tar)
@@ -236,7 +227,7 @@ def test_kapture_and_we_read_the_same_depth_maps(tmp_path: Path) -> None:
 
 
 def test_kapture_and_we_read_the_same_pairs(tmp_path: Path) -> None:
-    pairs = [ImagePair("q", "m", 0.1 + 0.2), ImagePair("q", "a b", -1.0)]
+    pairs = [ImagePair("q", "m", 0.1 + 0.2), ImagePair("q", "a b", -1.0), ImagePair("m", "q", 2.0)]
     write_pairs(tmp_path / "pairs.txt", pairs)
     with open(tmp_path / "pairs.txt") as file:
         table = kapture.io.csv.table_from_file(file)

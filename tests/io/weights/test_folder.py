@@ -34,7 +34,6 @@ from megloc_kapture.io.weights import (
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder of weights."""
     place = tmp_path / "weights"
     place.mkdir()
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(place))
@@ -68,9 +67,7 @@ def test_published_files_have_the_size_and_sha256_of_the_registry(
     assert not any(key.startswith("module.") for key in read_weights(file))
 
 
-def test_the_folder_is_set_by_the_environment(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_environment_sets_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("MEGLOC_WEIGHTS", "../relative")
     monkeypatch.chdir(tmp_path)
     assert weights_folder() == tmp_path.parent / "relative"
@@ -113,9 +110,7 @@ def test_missing_weights_name_the_remedy(folder: Path, name: str, remedy: str) -
     assert isinstance(pickle.loads(pickle.dumps(caught.value)), MissingWeightsError)
 
 
-def test_a_file_given_by_its_path_is_not_compared_with_the_registry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_given_by_path_may_be_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fine-tuned network may have the name of a published file."""
     path = write(tmp_path / "superpoint_v1.pth")
     file = find_weights(str(path))
@@ -163,9 +158,7 @@ def test_code_in_a_checkpoint_is_not_run(code: object, tmp_path: Path) -> None:
     assert not (tmp_path / "made").exists()
 
 
-def test_added_files_are_recognised_by_sha256(
-    published: Path, folder: Path, tmp_path: Path
-) -> None:
+def test_added_files_are_recognised_by_hash(published: Path, folder: Path, tmp_path: Path) -> None:
     source = tmp_path / "download (1).bin"
     shutil.copyfile(published / "aliked" / "aliked-t16.pth", source)
     added = add_weights(source)
@@ -205,9 +198,7 @@ def test_broken_missing_and_different_files_are_not_added(folder: Path, tmp_path
     assert list(folder.iterdir()) == []
 
 
-def test_an_unverified_file_is_used_where_the_published_one_is_missing(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_an_unverified_file_replaces_a_missing_published_one(folder: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "superpoint_v1.pth", 3.0)
     added = add_weights(source, unverified=True)
     assert added.path == folder / "unverified" / "superpoint_v1.pth"

@@ -1,21 +1,24 @@
-"""Arrays of images and matches of pairs, in folders and tars, in and beside a kapture."""
+"""Arrays of images, matches of pairs, and points, in folders and tars, in and beside a kapture."""
 
 from __future__ import annotations
 
 import pickle
 import tarfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.io.colmap import load_pycolmap
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
-    ArrayKind,
     FeatureConfig,
     FeatureReader,
     FeatureWriter,
+    KaptureVectors,
     feature_folder,
     find_blob,
     list_blobs,
@@ -27,7 +30,13 @@ from megloc_kapture.io.kapture.matches import (
     MatchesReader,
     MatchesWriter,
     read_pairs,
-    write_pairs,
+)
+from megloc_kapture.io.kapture.points import (
+    COVARIANCES_FILE,
+    read_point_covariances,
+    read_points3d,
+    write_ply,
+    write_point_covariances,
 )
 
 KEYPOINTS = FeatureConfig("name inside", np.dtype("float32"), 3)
@@ -43,9 +52,7 @@ GLOBAL = FeatureConfig("g", np.dtype("float32"), 16, None, "L2")
         ("global_features", GLOBAL, "global_features/T 1/global_features"),
     ],
 )
-def test_arrays_outside_a_kapture_read_back_from_the_layout_of_kapture_localization(
-    tmp_path: Path, kind: ArrayKind, config: FeatureConfig, place: str
-) -> None:
+def test_orphan_arrays_read_back(tmp_path: Path, kind: Any, config: Any, place: str) -> None:
     """test_interop.py reads the layout inside a kapture with kapture itself."""
     shape = (config.dsize,) if kind == "global_features" else (5, config.dsize)
     array = (np.random.default_rng(0).normal(100, 50, shape)).astype(config.dtype)
@@ -66,9 +73,7 @@ def test_arrays_outside_a_kapture_read_back_from_the_layout_of_kapture_localizat
     read[...] = 0  # a copy that the caller may change
 
 
-def test_the_first_of_several_folders_is_used_and_their_configurations_must_agree(
-    tmp_path: Path,
-) -> None:
+def test_the_first_folder_is_used_and_all_configurations_must_agree(tmp_path: Path) -> None:
     values = {"map": {"a": 1.0, "both": 1.0}, "query": {"b": 2.0, "both": 2.0}}
     for part, images in values.items():
         writer = FeatureWriter(tmp_path / part, "keypoints", "T", KEYPOINTS, orphan=True)
@@ -114,9 +119,6 @@ def test_members_of_a_tar_of_the_current_folder_are_read_by_name(tmp_path: Path)
     assert list_blobs(open_folders([folder], "descriptors"), "descriptors") == {}
 
 
-# -------------------------------------------------------------------------------------- matches
-
-
 INDICES = np.array([[0, 7], [3, 2], [2**24 + 1, 5]])
 SCORES = np.array([0.5, 1 / 3, -1.0])
 
@@ -128,9 +130,7 @@ def matches_reader(root: Path, *, orphan: bool = False) -> MatchesReader:
 @pytest.mark.parametrize(
     ("pair", "orphan"), [(("a/x.jpg", "b.jpg"), False), (("b.jpg", "a/x.jpg"), True)]
 )
-def test_matches_read_back_in_either_order(
-    tmp_path: Path, pair: tuple[str, str], orphan: bool
-) -> None:
+def test_matches_read_back_either_way(tmp_path: Path, pair: tuple[str, str], orphan: bool) -> None:
     writer = MatchesWriter(tmp_path, "T", orphan=orphan)
     assert pair not in writer
     writer.write(*pair, INDICES, SCORES)
@@ -158,11 +158,82 @@ def test_files_named_in_the_other_order_are_read(tmp_path: Path) -> None:
     assert np.array_equal(matches.read("a", "b")[0], INDICES[:, ::-1])
 
 
-def test_pairs_read_back_in_their_order_without_repetitions(tmp_path: Path) -> None:
-    pairs = [ImagePair("q 2", "m/1", 1 / 3), ImagePair("q1", "m2", -1.0), ImagePair("m2", "q1", 2)]
-    write_pairs(tmp_path / "pairs.txt", [*pairs, ImagePair("q1", "m2", 5.0)])
-    assert read_pairs(tmp_path / "pairs.txt") == pairs
+def test_pairs_without_scores_are_in_the_order_of_their_rank(tmp_path: Path) -> None:
     for text in ("q1 m2\nq1 m1\n", "q1, m2\nq1, m1\n"):  # hloc's, and without a score
         (tmp_path / "pairs.txt").write_text(text)
         best_first = [ImagePair("q1", "m2", 0.0), ImagePair("q1", "m1", -1.0)]
         assert read_pairs(tmp_path / "pairs.txt") == best_first
+
+
+FOLDER = Path("reconstruction/global_features/G")
+NAMES = [f"{k % 3}/{k:03d}.jpg" for k in range(40)]
+
+
+def write(root: Path, rows: NDArray[np.floating]) -> FeatureReader:
+    config = FeatureConfig("g", rows.dtype, rows.shape[1], None, "L2")
+    writer = FeatureWriter(root, "global_features", "G", config)
+    for name, row in zip(NAMES, rows, strict=False):
+        writer.write(name, row)
+    return FeatureReader("global_features", "G", [root / FOLDER])
+
+
+def test_blocks_hold_unit_rows_in_the_order_of_the_images(tmp_path: Path) -> None:
+    rows = np.random.default_rng(0).normal(0, 50, (len(NAMES), 5))
+    features = write(tmp_path, rows)
+    images = [NAMES[k] for k in np.random.default_rng(1).permutation(len(NAMES))] + NAMES[:1]
+    expected = np.array([features.read(image) for image in images], dtype=np.float32)
+    unit = expected / np.linalg.norm(expected, axis=1)[:, None]
+    blocks = KaptureVectors(features, images)
+    assert blocks.shape == (len(images), 5)
+    np.testing.assert_allclose(blocks[:], unit, atol=1e-6)
+    np.testing.assert_allclose(blocks[3:12], unit[3:12], atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1.0, 1e37])
+def test_rows_have_unit_length_at_any_scale(tmp_path: Path, scale: float) -> None:
+    rows = np.array([[3, 4], [0, 0], [1, 0]]) * scale
+    read = KaptureVectors(write(tmp_path, rows.astype(np.float32)), NAMES[:3])[:3]
+    expected = [[0.6, 0.8], [0, 0], [1, 0]] if scale else np.zeros((3, 2))
+    np.testing.assert_allclose(read, expected, atol=1e-6)
+
+
+def test_images_without_a_usable_vector_are_named(tmp_path: Path) -> None:
+    rows = np.ones((3, 5))
+    rows[1, 2] = np.nan
+    features = write(tmp_path, rows)
+    with pytest.raises(DataError, match=rf"{NAMES[1]}.* not all values are finite"):
+        KaptureVectors(features, NAMES[:3])[:3]
+    with pytest.raises(DataError, match=r"no global_features of type 'G' for image 'no\.jpg'"):
+        KaptureVectors(features, ["no.jpg"])[:1]
+
+
+@pytest.mark.parametrize("content", ["", "# kapture format: 1.1\n# X, Y, Z, R, G, B\n\n\n# note"])
+def test_a_file_without_rows_has_no_points(tmp_path: Path, content: str) -> None:
+    (tmp_path / "p.txt").write_text(content)
+    assert read_points3d(tmp_path / "p.txt").shape == (0, 6)
+
+
+def test_covariances_read_back_and_are_read_only(tmp_path: Path) -> None:
+    assert read_point_covariances(tmp_path, 3) is None
+    values = np.arange(18.0).reshape(3, 6)
+    values[1] = np.nan
+    write_point_covariances(tmp_path, values)
+    actual = read_point_covariances(tmp_path, 3)
+    assert actual is not None and not actual.flags.writeable
+    np.testing.assert_array_equal(actual, values)
+    np.testing.assert_array_equal(np.load(tmp_path / COVARIANCES_FILE), values)
+
+
+XYZ = np.random.default_rng(0).normal(size=(20, 3))
+COLOURS = np.random.default_rng(1).integers(0, 256, (20, 3)).astype(np.uint8)
+
+
+def test_colmap_reads_the_ply(tmp_path: Path) -> None:
+    pycolmap = load_pycolmap()
+    write_ply(tmp_path / "points.ply", XYZ, COLOURS, deviation=np.arange(20))
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.import_PLY(str(tmp_path / "points.ply"))
+    points = [reconstruction.points3D[number] for number in sorted(reconstruction.points3D)]
+    # COLMAP keeps them in single precision
+    np.testing.assert_allclose([point.xyz for point in points], XYZ, rtol=1e-6)
+    np.testing.assert_array_equal([point.color for point in points], COLOURS)
