@@ -126,7 +126,6 @@ def colmaps_derivatives(given: Camera, at: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def assert_colmaps(given: Camera, at: NDArray[np.float64]) -> None:
-    """Compare pixels and derivatives with COLMAP's."""
     pixels, jacobian = project_with_jacobian(given, at)
     np.testing.assert_allclose(pixels, px_from_cam(given, at), atol=1e-9, rtol=0)
     assert jacobian.shape == (len(at), 2, 3)

@@ -3,53 +3,39 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import camera_models
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import bearing_rays, project, scaled_camera
+from megloc_kapture.geometry.cameras import pixel_rays, project, scaled_camera
 from megloc_kapture.geometry.projection import draw_depth_surface
 from megloc_kapture.geometry.warping import PosedImage, WarpedView, warp_to_view
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
-CAMERAS = [
-    Camera("SIMPLE_PINHOLE", 80, 60, (70.0, 41.0, 29.5)),
-    Camera("PINHOLE", 80, 60, (70.0, 66.0, 43.0, 28.5)),
-    Camera("SIMPLE_RADIAL", 80, 60, (70.0, 41.0, 29.0, -0.09)),
-    Camera("RADIAL", 80, 60, (70.0, 41.0, 29.0, -0.09, 0.02)),
-    Camera("OPENCV", 80, 60, (70.0, 68.0, 41.0, 29.0, -0.1, 0.02, 0.003, -0.002)),
-    Camera("OPENCV_FISHEYE", 80, 60, (60.0, 61.0, 41.0, 29.0, 0.02, -0.01, 0.003, -0.001)),
-    Camera("FOV", 80, 60, (60.0, 61.0, 41.0, 29.0, 0.9)),
-    Camera("THIN_PRISM_FISHEYE", 80, 60, (60, 61, 41, 29, 0.02, 0.01, 1e-3, 2e-3, 0, 0, 0, 0)),
-]
+CAMERAS = {model: scaled_camera(camera, 0.125) for model, camera in camera_models.CAMERAS.items()}
+PINHOLE = Camera("PINHOLE", 80, 60, (70.0, 66.0, 43.0, 28.5))
+Floats = NDArray[np.float64]
 STILL = RigidTransform.identity()
-Plane = tuple[NDArray[np.float64], float]  # n . x = d in the world
+Plane = tuple[Floats, float]  # n . x = d in the world
 
 
-def centres(camera: Camera) -> NDArray[np.float64]:
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    return np.stack([x.ravel(), y.ravel()], axis=1)
-
-
-def plane_depth(
-    camera: Camera, cam_from_world: RigidTransform, plane: Plane
-) -> NDArray[np.float64]:
+def plane_depth(camera: Camera, cam_from_world: RigidTransform, plane: Plane) -> Floats:
     normal, offset = plane
     rotation, centre = cam_from_world.rotation_matrix(), cam_from_world.center()
-    directions = bearing_rays(camera, centres(camera)) @ rotation
+    directions = pixel_rays(camera) @ rotation
     return (offset - normal @ centre) / (directions @ normal)
 
 
-def points_of(
-    camera: Camera, cam_from_world: RigidTransform, depth: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    return cam_from_world.inverse().apply(bearing_rays(camera, centres(camera)) * depth[:, None])
+def points_of(camera: Camera, cam_from_world: RigidTransform, depth: Floats) -> Floats:
+    return cam_from_world.inverse().apply(pixel_rays(camera) * depth[:, None])
 
 
-def paint(points: NDArray[np.float64]) -> NDArray[np.uint8]:
+def paint(points: Floats) -> NDArray[np.uint8]:
     """Return a smooth colour (N, 3) of points in the world."""
     phase = points @ np.array([[1.3, 0.4, 0.7], [0.5, 1.2, -0.6], [0.3, -0.8, 0.9]])
     return np.round(127.5 + 100 * np.sin(phase)).astype(np.uint8)
@@ -87,8 +73,7 @@ def turned(x_deg: float, y_deg: float, shift: tuple[float, float, float]) -> Rig
     return RigidTransform.from_matrix(rotation, np.array(shift))
 
 
-def assert_painted(view: WarpedView, points: NDArray[np.float64], where: NDArray[np.bool_]) -> None:
-    """Compare pixels with the colours of points."""
+def assert_painted(view: WarpedView, points: Floats, where: NDArray[np.bool_]) -> None:
     difference = np.abs(view.image.reshape(-1, 3)[where].astype(int) - paint(points[where]))
     assert difference.max() <= 3
 
@@ -96,9 +81,9 @@ def assert_painted(view: WarpedView, points: NDArray[np.float64], where: NDArray
 WALL: Plane = (np.array([0.1, -0.05, 1.0]), 4.0)
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
-def test_a_warped_plane_equals_the_true_view(camera: Camera) -> None:
-    other = CAMERAS[4]
+@pytest.mark.parametrize("model", CAMERAS)
+def test_a_warped_plane_equals_the_true_view(model: str) -> None:
+    camera, other = CAMERAS[model], CAMERAS["OPENCV"]
     there = turned(3.0, -6.0, (0.3, -0.1, 0.2))
     view = warp_to_view([on_plane(other, STILL, WALL)], camera, there)
     depth = plane_depth(camera, there, WALL)
@@ -119,17 +104,19 @@ def test_depth_of_a_separate_camera() -> None:
     small = Camera("PINHOLE", 50, 40, (38.0, 40.0, 26.0, 19.0))
     beside = turned(1.0, -2.0, (0.08, 0.01, -0.02))
     there = turned(-2.0, 5.0, (-0.2, 0.1, 0.1))
-    right = on_plane(CAMERAS[2], STILL, WALL, depth_camera=small, image_from_depth=beside)
-    view = warp_to_view([right], CAMERAS[1], there)
-    points = points_of(CAMERAS[1], there, plane_depth(CAMERAS[1], there, WALL))
+    right = on_plane(
+        CAMERAS["SIMPLE_RADIAL"], STILL, WALL, depth_camera=small, image_from_depth=beside
+    )
+    view = warp_to_view([right], PINHOLE, there)
+    points = points_of(PINHOLE, there, plane_depth(PINHOLE, there, WALL))
     valid = view.valid.ravel()
     assert valid.mean() > 0.6
     assert_painted(view, points, valid)
     # without the offset the depth is wrong
     assert right.depth is not None
     unmoved = replace(right, depth=replace(right.depth, image_from_depth=STILL))
-    forgotten = warp_to_view([unmoved], CAMERAS[1], there)
-    truth = plane_depth(CAMERAS[1], there, WALL)
+    forgotten = warp_to_view([unmoved], PINHOLE, there)
+    truth = plane_depth(PINHOLE, there, WALL)
     np.testing.assert_allclose(view.depth_m.ravel()[valid], truth[valid], rtol=2e-4)
     both = valid & forgotten.valid.ravel()
     assert np.median(np.abs(forgotten.depth_m.ravel()[both] / truth[both] - 1)) > 2e-3
@@ -137,17 +124,17 @@ def test_depth_of_a_separate_camera() -> None:
 
 def test_a_view_from_nearer_has_no_holes() -> None:
     near = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.2))  # five times as large
-    view = warp_to_view([on_plane(CAMERAS[1], STILL, WALL)], CAMERAS[1], near)
+    view = warp_to_view([on_plane(PINHOLE, STILL, WALL)], PINHOLE, near)
     assert view.valid.all()
-    points = points_of(CAMERAS[1], near, plane_depth(CAMERAS[1], near, WALL))
+    points = points_of(PINHOLE, near, plane_depth(PINHOLE, near, WALL))
     assert_painted(view, points, view.valid.ravel())
 
 
 @pytest.mark.parametrize("scale", [0.37, 2.0])
 def test_a_scaled_view_shows_the_same(scale: float) -> None:
     there = turned(2.0, 4.0, (0.1, 0.0, 0.1))
-    camera = CAMERAS[4]
-    view = warp_to_view([on_plane(CAMERAS[1], STILL, WALL)], camera, there, scale=scale)
+    camera = CAMERAS["OPENCV"]
+    view = warp_to_view([on_plane(PINHOLE, STILL, WALL)], camera, there, scale=scale)
     small = scaled_camera(camera, scale)
     assert view.image.shape == (small.height, small.width, 3)
     assert (small.width, small.height) == (round(80 * scale), round(60 * scale))
@@ -161,7 +148,7 @@ def test_a_scaled_view_shows_the_same(scale: float) -> None:
     np.testing.assert_allclose(full * ratio, reduced, atol=1e-9)
 
 
-def board(camera: Camera, pose: RigidTransform) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def board(camera: Camera, pose: RigidTransform) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the depth (N,) of a board in front of a wall, and the board's pixels."""
     wall = plane_depth(camera, pose, (np.array([0.0, 0.0, 1.0]), 4.0))
     front = plane_depth(camera, pose, (np.array([0.0, 0.0, 1.0]), 2.0))
@@ -171,7 +158,7 @@ def board(camera: Camera, pose: RigidTransform) -> tuple[NDArray[np.float64], ND
 
 
 def board_source(pose: RigidTransform) -> PosedImage:
-    camera = CAMERAS[1]
+    camera = PINHOLE
     depth, _ = board(camera, pose)
     image = paint(points_of(camera, pose, depth)).reshape(60, 80, 3)
     measured = DepthView(camera, depth.reshape(60, 80).astype(np.float32), STILL)
@@ -186,7 +173,7 @@ def check_board(view: WarpedView, *, hidden: bool = True) -> None:
 
     By hand: the board ends at column 39.5, and hides the wall from the source up to column 50.
     """
-    points = points_of(CAMERAS[1], ASIDE, board(CAMERAS[1], ASIDE)[0])
+    points = points_of(PINHOLE, ASIDE, board(PINHOLE, ASIDE)[0])
     where = np.zeros((60, 80), bool)
     where[28, [*range(2, 38), *range(52, 67)]] = True
     where[28, 42:49] = not hidden
@@ -197,11 +184,11 @@ def check_board(view: WarpedView, *, hidden: bool = True) -> None:
 
 def test_references_fill_each_others_holes() -> None:
     sources = [board_source(STILL), board_source(turned(0.0, 0.0, (-1.0, 0.2, 0.0)))]
-    single = warp_to_view(sources[:1], CAMERAS[1], ASIDE)
+    single = warp_to_view(sources[:1], PINHOLE, ASIDE)
     check_board(single)
     empty = ~single.valid
     assert (single.image[empty] == 0).all() and (single.source[empty] == -1).all()
-    both = warp_to_view(sources, CAMERAS[1], ASIDE)
+    both = warp_to_view(sources, PINHOLE, ASIDE)
     check_board(both, hidden=False)
     assert both.valid.sum() > single.valid.sum() + 100
     assert set(np.unique(both.source)) >= {0, 1}
@@ -210,17 +197,17 @@ def test_references_fill_each_others_holes() -> None:
 def test_the_reference_at_the_smaller_angle_is_used() -> None:
     there = turned(0.0, 1.0, (0.05, 0.0, 0.0))
     far = turned(0.0, -12.0, (0.9, 0.0, 0.0))
-    sources = [on_plane(CAMERAS[1], far, WALL), on_plane(CAMERAS[1], STILL, WALL)]
-    view = warp_to_view(sources, CAMERAS[1], there)
-    at_both = warp_to_view(sources[:1], CAMERAS[1], there).valid
-    at_both &= warp_to_view(sources[1:], CAMERAS[1], there).valid
+    sources = [on_plane(PINHOLE, far, WALL), on_plane(PINHOLE, STILL, WALL)]
+    view = warp_to_view(sources, PINHOLE, there)
+    at_both = warp_to_view(sources[:1], PINHOLE, there).valid
+    at_both &= warp_to_view(sources[1:], PINHOLE, there).valid
     assert at_both.mean() > 0.3
     assert (view.source[at_both] == 1).all()
 
 
 def test_a_surface_from_behind_is_invalid() -> None:
     behind = turned(0.0, 180.0, (0.0, 0.0, 8.0))  # behind the wall
-    view = warp_to_view([on_plane(CAMERAS[1], STILL, WALL)], CAMERAS[1], behind)
+    view = warp_to_view([on_plane(PINHOLE, STILL, WALL)], PINHOLE, behind)
     assert not view.valid.any()
     assert (view.depth_m > 0).mean() > 0.5
 
@@ -228,13 +215,13 @@ def test_a_surface_from_behind_is_invalid() -> None:
 def test_masked_pixels_and_missing_depth_are_invalid() -> None:
     mask = np.ones((60, 80), bool)
     mask[20:30, 30:50] = False
-    masked = on_plane(CAMERAS[1], STILL, WALL, mask=mask)
-    np.testing.assert_array_equal(warp_to_view([masked], CAMERAS[1], STILL).valid, mask)
+    masked = on_plane(PINHOLE, STILL, WALL, mask=mask)
+    np.testing.assert_array_equal(warp_to_view([masked], PINHOLE, STILL).valid, mask)
     for nothing in (0.0, -1.0, np.nan, np.inf):
-        source = on_plane(CAMERAS[1], STILL, WALL)
+        source = on_plane(PINHOLE, STILL, WALL)
         assert source.depth is not None
         source.depth.depth_m[10:20, 40:60] = nothing
-        view = warp_to_view([source], CAMERAS[1], STILL)
+        view = warp_to_view([source], PINHOLE, STILL)
         assert not view.valid[11:19, 41:59].any()
         assert view.valid[:9].all()
         assert np.isfinite(view.depth_m).all()
@@ -243,25 +230,23 @@ def test_masked_pixels_and_missing_depth_are_invalid() -> None:
 def test_points_that_only_the_depth_camera_sees_are_hidden() -> None:
     # the depth sensor sees the wall behind the board, the camera does not
     source = board_source(STILL)
-    depth = board(CAMERAS[1], ASIDE)[0].reshape(60, 80).astype(np.float32)
+    depth = board(PINHOLE, ASIDE)[0].reshape(60, 80).astype(np.float32)
     beside = replace(source, depth=DepthView(source.camera, depth, ASIDE.inverse()))
-    check_board(warp_to_view([beside], CAMERAS[1], ASIDE))
+    check_board(warp_to_view([beside], PINHOLE, ASIDE))
 
 
 def test_no_sources_give_an_empty_view() -> None:
-    view = warp_to_view([], CAMERAS[0], STILL)
+    view = warp_to_view([], PINHOLE, STILL)
     assert not view.valid.any() and (view.depth_m == 0).all() and (view.source == -1).all()
 
 
 @pytest.mark.parametrize("corners", [[(0, 0)], [(0, 2)], [(2, 2)], [(0, 0), (2, 0)]])
 @pytest.mark.parametrize("depth_m", [0.0, 5.0])
-def test_a_corner_without_depth_or_far_behind_costs_half_a_quad(
-    corners: list[tuple[int, int]], depth_m: float
-) -> None:
+def test_a_corner_without_depth_or_behind_costs_half_a_quad(corners: Any, depth_m: float) -> None:
     camera = Camera("PINHOLE", 3, 3, (3.0, 3.0, 1.5, 1.5))
     depth = np.full((3, 3), 2.0, np.float32)
     depth[tuple(np.transpose(corners))] = depth_m
-    rays = bearing_rays(camera, centres(camera))
+    rays = pixel_rays(camera)
     drawn, front = draw_depth_surface(
         depth, rays, STILL, scaled_camera(camera, 20.0), max_jump=0.1, near_m=0.1, field=9.0
     )

@@ -41,7 +41,6 @@ Array = NDArray[np.float64]
 def scene(
     camera: Camera, pose: RigidTransform, rng: np.random.Generator, count: int = 100
 ) -> tuple[Array, Array]:
-    """Pixels (N, 2) and world points (N, 3)."""
     world = pose.inverse().apply(rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3)))
     return project(camera, pose, world), world
 
@@ -93,15 +92,11 @@ def test_the_threshold_and_the_least_number_of_inliers_are_options() -> None:
 
 
 DIRECTIONS = np.random.default_rng(0).normal(size=(40, 6))
-
-
 MATRIX = DIRECTIONS.T @ DIRECTIONS
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_in_any_unit_the_covariance_is_the_inverse_or_none_if_degenerate(
-    unit: float,
-) -> None:
+def test_in_any_unit_the_covariance_is_the_inverse_or_none_if_degenerate(unit: float) -> None:
     scale = np.diag([1.0, 1.0, 1.0, unit, unit, unit])
     # a few exact matches do not prove a zero variance
     for variance, expected in ((4.0, 4.0), (1e-12, 0.01)):
@@ -154,8 +149,6 @@ def test_equal_to_colmaps_covariance(model: str) -> None:
 
 
 RIG_CAMERAS = (PINHOLE, CAMERAS["OPENCV_FISHEYE"], STRONG)
-
-
 AT_ORIGIN = RigidTransform.identity()
 
 
@@ -279,7 +272,6 @@ def test_many_threads_give_the_same_poses() -> None:
 
 
 def colmaps(views: list[View]) -> RigidTransform:
-    """Return COLMAP's refined generalized pose."""
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = 12.0
     ransac.random_seed = 0

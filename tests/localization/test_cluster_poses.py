@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -222,9 +223,7 @@ def partition(labels: NDArray[np.int64]) -> set[frozenset[int]]:
 @given(
     st.lists(st.tuples(*[st.integers(-20, 20)] * 3), max_size=30, unique=True), st.integers(1, 12)
 )
-def test_centres_are_clustered_by_single_linkage(
-    centers: list[tuple[int, int, int]], radius: int
-) -> None:
+def test_centres_are_clustered_by_single_linkage(centers: Any, radius: int) -> None:
     points = np.array(centers, np.float64).reshape(-1, 3)
     labels = cluster_by_centers(points, radius)
     if len(centers) < 2:
@@ -246,9 +245,7 @@ def test_centres_are_clustered_by_single_linkage(
         ([[5, 0, 0], [0, 5, 0], [0, 0, 5]], 1, [0, 0, 0]),  # no shared points: a single cluster
     ],
 )
-def test_images_with_enough_shared_points_join(
-    shared: list[list[int]], least: int, labels: list[int]
-) -> None:
+def test_images_with_enough_shared_points_join(shared: Any, least: int, labels: list[int]) -> None:
     assert cluster_by_shared_points(np.array(shared), least).tolist() == labels
 
 

@@ -56,7 +56,6 @@ def seen_by(
 
 
 def misfit(factor: float, *, noise_px: float = 1.0, seed: int = 0) -> tuple[str, float] | None:
-    """Check a camera whose focal length is wrong by the factor."""
     pixels, points, _ = seen_by(Camera.pinhole(1600, 1200, 1400.0), seed=seed, noise_px=noise_px)
     view = View(Camera.pinhole(1600, 1200, 1400.0 * factor), ALONE, pixels, points)
     result = rig_pose([view])
@@ -118,7 +117,6 @@ def test_no_misfit_of_a_wall_seen_straight_on() -> None:
 
 
 def solved(camera: Camera, pixels: Floats, points: Floats) -> Pose | Failure:
-    """Estimate pose and camera from an uncertain camera."""
     problem = PoseProblem.of([View(camera, ALONE, pixels, points)])
     problem, estimate = estimate_with_intrinsics(problem, OPTIONS)
     assert isinstance(estimate, PoseEstimate)

@@ -56,7 +56,6 @@ def good_map(seed: int = 0, noise_px: float = 1.0) -> Map:
 
 
 def each(change: Callable[[ObservedKeypoints], dict[str, Any]]) -> Callable[[Map], Map]:
-    """Change fields of every image."""
     return lambda m: ([replace(image, **change(image)) for image in m[0]], m[1])
 
 
@@ -161,9 +160,7 @@ def test_unusual_cameras_have_no_fault(camera: Camera) -> None:
         (0.5, False, ("centre", "corner")),
     ],
 )
-def test_pixel_origins_of_keypoints_and_intrinsics(
-    shift_px: float, centred: bool, expected: tuple[str, str]
-) -> None:
+def test_origins_of_keypoints_and_intrinsics(shift_px: float, centred: bool, expected: Any) -> None:
     images, xyz = with_pixels(lambda k: k + np.float32(shift_px))(good_map(noise_px=0.3))
     principal = (319.5, 239.5) if centred else (320.0, 240.0)
     cameras = [Camera("PINHOLE", 640, 480, (500.0, 510.0, *principal))]

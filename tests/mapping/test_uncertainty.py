@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 from camera_models import CAMERAS
+from corner import pose_at
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -104,23 +105,14 @@ def test_covariances_equal_ceres(model: str, narrow: bool) -> None:
     np.testing.assert_allclose(deviations**2, np.linalg.eigvalsh(theirs), rtol=1e-7)
 
 
-def looking_at_origin(centers: Floats) -> list[RigidTransform]:
-    poses = []
-    for center in centers:
-        forward = -center / np.linalg.norm(center)
-        right = np.cross((0.0, 1.0, 0.0), forward)
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        poses.append(RigidTransform.from_matrix(rotation, -rotation @ center))
-    return poses
-
-
-CENTERS = np.array([[-1.0, 0.1, -6.0], [0.3, -0.4, -5.0], [1.2, 0.2, -6.5], [0.1, 0.9, -5.5]])
+# around the origin, which all of them see
+CENTERS = ((-1.0, 0.1, -6.0), (0.3, -0.4, -5.0), (1.2, 0.2, -6.5), (0.1, 0.9, -5.5))
+POSES = [pose_at(center, 4.0 - 3 * k, 2.0 * k) for k, center in enumerate(CENTERS)]
 FISHEYE = CAMERAS["OPENCV_FISHEYE"]
 
 
 def test_undetermined_points_have_no_covariance() -> None:
-    poses = looking_at_origin(CENTERS)
+    poses = POSES
     points = np.zeros((5, 3))
     # one view; the same view twice; no view; two views; two views, one of them from behind
     point_ids = np.array([0, 1, 1, 3, 3, 4, 4])
@@ -139,7 +131,7 @@ def test_undetermined_points_have_no_covariance() -> None:
 
 
 def test_the_order_of_observations_and_a_far_origin_do_not_matter() -> None:
-    poses, cameras = looking_at_origin(CENTERS), [FISHEYE] * 4
+    poses, cameras = POSES, [FISHEYE] * 4
     points = np.array([[0.1, 0.0, 0.2], [-0.3, 0.1, 0.0]])
     point_ids, image_ids = np.array([0, 0, 0, 1, 1, 1]), np.array([0, 1, 2, 1, 2, 3])
     straight = point_covariances(points, point_ids, image_ids, cameras, poses)

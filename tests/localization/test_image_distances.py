@@ -1,29 +1,85 @@
-"""The structure distance of images, and displacements of map points in them."""
+"""The plugins lpips and structure: distances of images, and displacements of map points."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from corner import CAMERA, render
+from images import Image, texture
 from numpy.typing import NDArray
+from poses import rigid
 from scenes import Scene
 from scipy.ndimage import gaussian_filter
 
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.localization.lpips import LpipsDistance, LpipsOptions
 from megloc_kapture.localization.structure import StructureDistance, _displacements_px
+from megloc_kapture.nets.lpips import Lpips
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import IMAGE_DISTANCES
 from megloc_kapture.values import RigidTransform
 
-Image = NDArray[np.uint8]
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Random weights of SqueezeNet's layout, as a trunk's file and one of heads."""
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(0)
+    state = {key: value.abs() * 0.3 for key, value in Lpips("squeeze").state_dict().items()}
+    trunk = {key: value for key, value in state.items() if key.startswith("features.")}
+    torch.save(trunk, folder / "trunk.pth")
+    torch.save({key: state[key] for key in state.keys() - trunk.keys()}, folder / "heads.pth")
+    return folder / "trunk.pth", folder / "heads.pth"
+
+
+def distance(files: tuple[Path, Path], **options: object) -> Any:
+    trunk, heads = map(str, files)
+    given = {"net": "squeeze", "trunk": trunk, "heads": heads, "device": "cpu", **options}
+    return load_plugin(IMAGE_DISTANCES, "lpips", given)
+
+
+def pictures(count: int = 2, height: int = 80) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (count, height, 96, 3), dtype=np.uint8)
+
+
+PICTURED = np.ones((80, 96), bool)
+
+
+def test_the_distance_equals_the_networks(files: tuple[Path, Path]) -> None:
+    plugin = distance(files)
+    assert isinstance(plugin, LpipsDistance)
+    assert sorted(plugin.weights()) == ["heads.pth", "trunk.pth"]
+    a, b = pictures()
+    valid = PICTURED.copy()
+    valid[:, :30] = False
+    net = Lpips("squeeze")
+    net.load_state_dict({k: v for f in files for k, v in torch.load(f, weights_only=True).items()})
+    tensors = [torch.from_numpy(x.transpose(2, 0, 1)[None] / 255.0).float() for x in (a, b)]
+    with torch.inference_mode():
+        expected = float(net(*tensors, torch.from_numpy(valid)[None, None].float())[0])
+    assert expected > 0
+    assert plugin.distance(a, b, valid) == pytest.approx(expected, rel=1e-5)
+    assert plugin.distance(a, a, valid) == 0.0
+    half = distance(files, half_precision=True).distance(a, b, PICTURED)
+    assert half == pytest.approx(plugin.distance(a, b, PICTURED), rel=0.1)
+
+
+def test_missing_and_mismatched_weights_are_named(files: tuple[Path, Path]) -> None:
+    with pytest.raises(MissingWeightsError, match="lpips-trunk-vgg"):
+        LpipsDistance(LpipsOptions.model_validate({"net": "vgg"}))
+    with pytest.raises(DataError, match=r"features\.0\.weight"):
+        distance(files, net="alex").distance(*pictures(), PICTURED)
+
+
 FULL = np.ones((60, 80), bool)
-
-
-def picture(seed: int, low: int = 50, high: int = 200) -> Image:
-    """Coloured blobs, uint8 (60, 80, 3)."""
-    coarse = np.random.default_rng(seed).uniform(low, high, (12, 16, 3)).astype(np.float32)
-    return cv2.resize(coarse, (80, 60), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+FIRST, SECOND, OTHER = (texture(60, 80, seed, 3.0) for seed in range(3))
 
 
 def by_scipy(a: Image, b: Image, valid: NDArray[np.bool_]) -> float:
@@ -46,35 +102,36 @@ def by_scipy(a: Image, b: Image, valid: NDArray[np.bool_]) -> float:
     return float(dissimilarity[valid & (share >= 0.5)].mean())
 
 
+def structure_distance(a: Image, b: Image, valid: NDArray[np.bool_] = FULL) -> float:
+    return StructureDistance().distance(a, b, valid)
+
+
 def test_the_distance_is_the_mean_over_windows() -> None:
     valid = FULL.copy()
     valid[:25, 30:] = False
     valid[40:, 5] = False
-    expected = by_scipy(picture(0), picture(1), valid)
+    expected = by_scipy(FIRST, SECOND, valid)
     assert 0.3 < expected < 1.7
-    result = StructureDistance().distance(picture(0), picture(1), valid)
-    assert result == pytest.approx(expected, rel=1e-3)
+    assert structure_distance(FIRST, SECOND, valid) == pytest.approx(expected, rel=1e-3)
 
 
 def test_invalid_pixels_are_ignored() -> None:
-    a, b, other = picture(0), picture(1), picture(5)
     valid = FULL.copy()
     valid[20:40, 20:60] = False
-    changed = np.where(valid[..., None], b, other)
-    assert StructureDistance().distance(a, changed, valid) == StructureDistance().distance(
-        a, b, valid
-    )
-    same = np.where(valid[..., None], a, other)
-    assert StructureDistance().distance(a, same, valid) == pytest.approx(0.0, abs=1e-4)
-    assert StructureDistance().distance(a, same, FULL) > 0.05
+    changed, same = (np.where(valid[..., None], image, OTHER) for image in (SECOND, FIRST))
+    expected = structure_distance(FIRST, SECOND, valid)
+    assert structure_distance(FIRST, changed, valid) == expected
+    assert structure_distance(FIRST, same, valid) == pytest.approx(0.0, abs=1e-4)
+    assert structure_distance(FIRST, same) > 0.05
 
 
-def test_the_distance_without_valid_pixels_is_infinite() -> None:
-    a, b = picture(0), picture(1)
-    assert StructureDistance().distance(a, b, ~FULL) == np.inf
+def test_the_distance_without_valid_pixels_is_infinite(files: tuple[Path, Path]) -> None:
+    assert distance(files).distance(*pictures(), ~PICTURED) == np.inf
+    assert distance(files).distance(*pictures(height=40), PICTURED[:40]) == np.inf
     single = ~FULL
     single[30, 40] = True
-    assert StructureDistance().distance(a, b, single) == np.inf
+    for valid in (~FULL, single):
+        assert structure_distance(FIRST, SECOND, valid) == np.inf
 
 
 DEPTH_M = 6.0  # of the wall that the cameras face
@@ -90,8 +147,7 @@ def scene_of(query: Image, **poses: RigidTransform) -> Scene:
 def moved(
     x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0, turn_deg: float = 0.0
 ) -> RigidTransform:
-    half = math.radians(turn_deg) / 2
-    return RigidTransform((math.cos(half), 0.0, 0.0, math.sin(half)), (x_m, y_m, z_m))
+    return rigid([0.0, 0.0, math.radians(turn_deg)], [x_m, y_m, z_m])
 
 
 def on_plane(count: int = 200) -> NDArray[np.float64]:
