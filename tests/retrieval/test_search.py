@@ -102,7 +102,7 @@ needs_kapture_localization = pytest.mark.skipif(
     importlib.util.find_spec("kapture_localization") is None,
     reason="kapture-localization is not installed (make test installs it)",
 )
-OPERATORS = [FusionOptions(method="mean"), FusionOptions()]
+OPERATORS = [FusionOptions(method="mean"), FusionOptions(method="ghm")]
 
 
 def theirs(matrices: Any, options: FusionOptions, weights: Any) -> NDArray[np.float64]:

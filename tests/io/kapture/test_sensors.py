@@ -127,7 +127,9 @@ def test_the_camera_of_an_image_is_returned_or_its_lack_named(nested: KaptureDat
         nested.camera_of("r2.jpg")
 
 
-def test_cameras_of_numpy_numbers_are_written_like_others() -> None:
+def test_a_sensor_keeps_every_digit_of_its_camera() -> None:
+    awkward = Camera("SIMPLE_RADIAL", 7, 5, (1 / 3, 0.1 + 0.2, 1e-300, -5e-324))
+    assert Sensor.from_camera(awkward).camera() == awkward
     of_numpy = Camera("SIMPLE_PINHOLE", np.int64(7), np.int32(5), np.array([1.5, 2, 3]))  # type: ignore[arg-type]
     assert Sensor.from_camera(of_numpy).params == ("SIMPLE_PINHOLE", "7", "5", "1.5", "2", "3")
     with pytest.raises(DataError, match="'gnss'"):
