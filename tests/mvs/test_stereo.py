@@ -13,7 +13,13 @@ from corner import CAMERA, WALLS, depth_m, pose_at, render
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, PluginError
-from megloc_kapture.geometry.cameras import bearing_rays, project, px_from_cam, scaled_camera
+from megloc_kapture.geometry.cameras import (
+    bearing_rays,
+    pixel_rays,
+    project,
+    px_from_cam,
+    scaled_camera,
+)
 from megloc_kapture.io.colmap import MapImage
 from megloc_kapture.io.colmap_mapping import has_cuda, map_path, read_map, write_workspace
 from megloc_kapture.mvs.kernels import add_path, best_labels, correlate
@@ -82,9 +88,7 @@ def test_depth_sigma_and_normals_of_two_walls(estimates: list[DepthEstimate]) ->
     normals = [rotation @ np.cross([0.0, 1.0, 0.0], along) for _, along, _, _ in WALLS]
     cosines = np.max([np.abs(result.normals[known] @ normal) for normal in normals], axis=0)
     assert np.median(np.rad2deg(np.arccos(np.minimum(cosines, 1)))) < 4
-    fx, fy, cx, cy = view(0).camera.params
-    y, x = np.mgrid[: exact.shape[0], : exact.shape[1]]
-    rays = np.stack([(x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, np.ones_like(exact)], axis=-1)
+    rays = pixel_rays(view(0).camera).reshape(*exact.shape, 3)
     assert ((result.normals * rays).sum(axis=-1)[known] < 0).all()  # towards the camera
     # windows at the border leave the image
     rim = np.ones(exact.shape, bool)
@@ -239,13 +243,9 @@ def test_the_range_of_depth_ignores_outliers() -> None:
     assert depth_range(np.array([3.0, 4.0, -1.0])) is None
 
 
-def _view(center_m: tuple[float, float, float]) -> StereoView:
-    image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
-    return StereoView(image, CAMERA, pose_at(center_m, 0, 0))
-
-
 def test_a_pixel_of_error_moves_depth_as_the_baseline_says() -> None:
-    reference, near, far = _view((0, 0, 0)), _view((0.5, 0, 0)), _view((1.0, 0, 0))
+    blank = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    reference, near, far = (StereoView(blank, CAMERA, pose_at((x, 0, 0))) for x in (0, 0.5, 1))
     depth: NDArray[np.float32] = depth_m(reference.cam_from_world).astype(np.float32)
     depth[:10] = 0
     estimate = DepthEstimate(depth, 0.01 * depth, np.zeros((*depth.shape, 3), np.float32))
@@ -334,8 +334,7 @@ NAMES = ["a/0.png", "a/1.png", "b/2.png"]
 def _normals(number: int) -> np.ndarray:
     """Normals (H, W, 3) of the two walls, in the camera's frame, towards it."""
     rotation, exact = SIDE_BY_SIDE[number].rotation_matrix(), depth_m(SIDE_BY_SIDE[number])
-    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
-    rays = bearing_rays(CAMERA, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(*exact.shape, 3)
+    rays = pixel_rays(CAMERA).reshape(*exact.shape, 3)
     world = SIDE_BY_SIDE[number].inverse().apply((rays * exact[..., None]).reshape(-1, 3))
     result = np.zeros((exact.size, 3))
     for origin, along, _, _ in WALLS:
@@ -357,22 +356,7 @@ def write_map(path: Path, array: np.ndarray) -> None:
     path.write_bytes(head + np.ascontiguousarray(values.transpose(2, 0, 1)).tobytes())
 
 
-def fuse(root: Path) -> np.ndarray:
-    """Fuse the maps of a workspace by COLMAP; points (N, 3) in the world."""
-    options = pycolmap.StereoFusionOptions()
-    options.min_num_pixels = 2
-    options.num_threads = 1
-    fused = pycolmap.stereo_fusion(
-        str(root / "fused.ply"),
-        str(root),
-        input_type="photometric",
-        options=options,
-        output_type="PLY",
-    )
-    return np.array([point.xyz for point in fused.points3D.values()])
-
-
-def _workspace(root: Path) -> None:
+def test_colmap_fuses_the_maps_to_the_two_walls(tmp_path: Path) -> None:
     exact = depth_m(SIDE_BY_SIDE[1])
     y, x = np.mgrid[20:280:15, 20:380:15]
     px = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
@@ -383,15 +367,17 @@ def _workspace(root: Path) -> None:
         for name, pose in zip(NAMES, SIDE_BY_SIDE, strict=True)
     ]
     pixels = [render(pose) for pose in SIDE_BY_SIDE]
-    write_workspace(root, images, pixels, [(rows, rows)] * 3, xyz)
+    write_workspace(tmp_path, images, pixels, [(rows, rows)] * 3, xyz)
     for number, name in enumerate(NAMES):
-        write_map(map_path(root, "depth", name), depth_m(SIDE_BY_SIDE[number]))
-        write_map(map_path(root, "normal", name), _normals(number))
-
-
-def test_colmap_fuses_the_maps_to_the_two_walls(tmp_path: Path) -> None:
-    _workspace(tmp_path)
-    fused = fuse(tmp_path)
+        write_map(map_path(tmp_path, "depth", name), depth_m(SIDE_BY_SIDE[number]))
+        write_map(map_path(tmp_path, "normal", name), _normals(number))
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels = 2
+    options.num_threads = 1
+    kinds = {"input_type": "photometric", "output_type": "PLY"}
+    ply = str(tmp_path / "fused.ply")
+    model = pycolmap.stereo_fusion(ply, str(tmp_path), options=options, **kinds)
+    fused = np.array([point.xyz for point in model.points3D.values()])
     assert len(fused) > 50_000
     distances = np.min(
         [np.abs((fused - o) @ np.cross(along, [0.0, 1.0, 0.0])) for o, along, _, _ in WALLS], axis=0

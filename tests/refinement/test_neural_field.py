@@ -6,9 +6,10 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,13 +33,8 @@ QUICK = FieldTrainingOptions(steps=8, rays_per_step=128, device="cpu")
 IDENTITY = RigidTransform.identity()
 
 
-def train_field(
-    given: Sequence[PosedImage],
-    options: FieldTrainingOptions,
-    *,
-    progress: Callable[[int, float, list[float]], None] | None = None,
-) -> tuple[NeuralField, dict[str, float]]:
-    return FieldTrainer(given, options).train(progress=progress)
+def state_of(given: list[PosedImage], options: FieldTrainingOptions) -> dict[str, Any]:
+    return FieldTrainer(given, options).train()[0].module.state_dict()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -70,7 +66,6 @@ def views(
 
 
 def depth_error(field: NeuralField, tests: list[PosedImage]) -> float:
-    """Return the median relative error of rendered depths."""
     errors = []
     for view in tests:
         assert view.depth is not None
@@ -87,23 +82,23 @@ def test_a_small_field_learns_the_room_deterministically() -> None:
     def progress(step: int, seconds: float, psnr_db: list[float]) -> None:
         seen.append((step, psnr_db))
 
-    field, psnr = train_field(views(8), options, progress=progress)
+    field, psnr = FieldTrainer(views(8), options).train(progress=progress)
     assert set(psnr) == {"007.png"} and len(field.images) == 7
     # an image of one colour has 14 dB
     assert min(psnr.values()) > 16 and depth_error(field, views(4)) < 0.2
     assert [step for step, _ in seen] == list(range(12, 60, 12))
     assert all(len(values) == 1 for _, values in seen)
     brief = QUICK.model_copy(update={"steps": 3})
-    first, second = (train_field(views(5), brief)[0].module.state_dict() for _ in range(2))
+    first, second = (state_of(views(5), brief) for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)
-    changed, _ = train_field(views(5), brief.model_copy(update={"seed": 1}))
-    assert not torch.equal(changed.module.state_dict()["planes.0"], first["planes.0"])
+    changed = state_of(views(5), brief.model_copy(update={"seed": 1}))
+    assert not torch.equal(changed["planes.0"], first["planes.0"])
 
 
 def test_half_precision_learns_nearly_the_same() -> None:
     brief = QUICK.model_copy(update={"steps": 2})
     half = brief.model_copy(update={"half_precision": True})
-    fields = [train_field(views(5), each)[0] for each in (brief, half)]
+    fields = [FieldTrainer(views(5), each).train()[0] for each in (brief, half)]
     exact, near = (field.module.state_dict() for field in fields)
     assert any(not torch.equal(exact[name], near[name]) for name in exact)
     images = [field.render(SMALL, IDENTITY)[0].image for field in fields]
@@ -115,7 +110,7 @@ def test_compiled_learns_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
     brief = QUICK.model_copy(update={"steps": 2})
     compiled = brief.model_copy(update={"compiled": True})
-    one, other = (train_field(views(5), each)[0].module.state_dict() for each in (brief, compiled))
+    one, other = (state_of(views(5), each) for each in (brief, compiled))
     for name in one:
         torch.testing.assert_close(one[name], other[name], atol=5e-3, rtol=0)
 
@@ -156,10 +151,10 @@ def test_resumed_training_equals_uninterrupted_training(monkeypatch: pytest.Monk
 def test_images_of_a_folder_may_share_their_light() -> None:
     given = [replace(v, name=f"{n % 2}/{v.name}") for n, v in enumerate(views(6))]
     options = QUICK.model_copy(update={"lights": "folder", "held_out_every": 2, "steps": 2})
-    field, psnr = train_field(given, options)
+    field, psnr = FieldTrainer(given, options).train()
     assert field.images == ("0/000.png", "0/002.png", "0/004.png") and len(psnr) == 3
     assert len(field.module.appearance.weight) == 1
-    field, psnr = train_field(given, options.model_copy(update={"held_out_every": 0}))
+    field, psnr = FieldTrainer(given, options.model_copy(update={"held_out_every": 0})).train()
     assert len(field.images) == 6 and not psnr
     assert len(field.module.transient.weight) == 6
     lights = {name: field.appearance_of(name) for name in field.images}
@@ -180,8 +175,7 @@ def test_masked_pixels_are_ignored() -> None:
         masked.append(PosedImage(view.image, *arguments))
         spoiled.append(PosedImage(image, *arguments))
     first, second, whole = (
-        train_field(given, QUICK.model_copy(update={"steps": 2}))[0].module.state_dict()
-        for given in (masked, spoiled, plain)
+        state_of(given, QUICK.model_copy(update={"steps": 2})) for given in (masked, spoiled, plain)
     )
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert not torch.equal(first["planes.0"], whole["planes.0"])
@@ -208,12 +202,12 @@ def test_depth_of_another_camera_is_transformed() -> None:
 def test_invalid_training_is_refused() -> None:
     few = views(1)
     with pytest.raises(DataError, match="too few"):
-        train_field(few, QUICK)
+        FieldTrainer(few, QUICK).train()
     (view,) = few
     hidden = replace(view, mask=np.zeros((24, 32), bool))
     with pytest.raises(DataError, match="no pixel"):
-        train_field([hidden, hidden], QUICK)
-    field, _ = train_field(views(4, depth=False), QUICK.model_copy(update={"steps": 1}))
+        FieldTrainer([hidden, hidden], QUICK).train()
+    field, _ = FieldTrainer(views(4, depth=False), QUICK.model_copy(update={"steps": 1})).train()
     with pytest.raises(DataError, match="not trained on an image 'x'"):
         field.appearance_of("x")
 
@@ -223,7 +217,7 @@ def test_two_lights_and_moving_objects_do_not_blur_the_field() -> None:
     clean = views(10, room.CAMERA, seed=2)
     trained = views(40, room.CAMERA, moving=True)
     options = FieldTrainingOptions(steps=1000, rays_per_step=1024, device="cpu")
-    field, _ = train_field(trained, options)
+    field, _ = FieldTrainer(trained, options).train()
     psnr_db = float(np.mean([field.held_out_psnr(view) for view in clean]))
     error = depth_error(field, clean)
     print(f"PSNR {psnr_db:.1f} dB, depth {error}")

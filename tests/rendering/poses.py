@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.values import Failure, Pose, RigidTransform
+from megloc_kapture.values import Failure, Pose, PoseRefinement, RigidTransform
 
 OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 # words of the message about a wrong convention, and a pose in that convention
@@ -49,6 +49,14 @@ def pose_errors(pose: RigidTransform, truth: RigidTransform) -> tuple[float, flo
     turn = Rotation.from_matrix(pose.rotation_matrix() @ truth.rotation_matrix().T)
     distance_m = np.linalg.norm(pose.center() - truth.center())
     return float(distance_m), float(np.degrees(turn.magnitude()))
+
+
+def assert_accurate(
+    result: PoseRefinement, truth: RigidTransform, max_m: float, max_deg: float
+) -> None:
+    assert result.accepted, result.reason
+    off_m, off_deg = pose_errors(result.cam_from_world, truth)
+    assert off_m < max_m and off_deg < max_deg
 
 
 def error_vector(pose: RigidTransform, truth: RigidTransform) -> NDArray[np.float64]:
