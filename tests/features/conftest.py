@@ -25,11 +25,6 @@ def superpoint_weights(random_weights: dict[str, Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def aslfeat_weights(random_weights: dict[str, Path]) -> Path:
-    return random_weights["aslfeat"]
-
-
-@pytest.fixture(scope="session")
 def photograph(shared_data: Path) -> Image:
     folder = shared_data / "scenes" / "fountain_p11" / "mapping" / "sensors" / "records_data"
     return read_image_rgb(folder / "0003.jpg")

@@ -13,7 +13,7 @@ import torch
 from convert_weights import delg_state
 from images import Image, random_image, texture
 from PIL import Image as PillowImage
-from published import delg_variables
+from published import delg_variables, plugin, small_megaloc
 from pydantic import ValidationError
 from safetensors.torch import save_file
 
@@ -30,7 +30,6 @@ from megloc_kapture.features.global_networks import (
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.nets import megaloc as nets_megaloc
 from megloc_kapture.nets.global_descriptors import ApGemNet, VggNetVlad, whitening_from
-from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet
 
 KINDS: dict[str, Any] = {
     "netvlad": NetVlad,
@@ -76,24 +75,10 @@ def write_delg(folder: Path) -> Path:
     return folder / "r50delg_mine.safetensors"
 
 
-def small_megaloc() -> MegaLocNet:
-    trunk = DinoV2(channels=12, depth=2, heads=3, grid=7)
-    sizes = {"clusters": 5, "cluster_size": 4, "token_size": 6, "descriptor_size": 10}
-    return MegaLocNet(trunk, **sizes)
-
-
 def write_megaloc(folder: Path) -> Path:
     tensors = {key: 0.3 * torch.randn(v.shape) for key, v in small_megaloc().state_dict().items()}
     save_file(tensors, folder / "megaloc-small.safetensors")
     return folder / "megaloc-small.safetensors"
-
-
-WRITERS: dict[str, Callable[[Path], Path]] = {
-    "apgem": write_apgem,
-    "delg": write_delg,
-    "megaloc": write_megaloc,
-}
-FILES: dict[str, Path] = {}
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -109,43 +94,47 @@ def _small_network(monkeypatch: pytest.MonkeyPatch) -> None:
 Make = Callable[..., GlobalNetwork[Any]]
 
 
-@pytest.fixture
-def make(tmp_path_factory: pytest.TempPathFactory, random_weights: dict[str, Path]) -> Make:
-    """Return a function that builds the plugin of a name."""
-    FILES["netvlad"] = random_weights["netvlad-pitts30k"]
-    FILES["openibl"] = random_weights["openibl"]
+@pytest.fixture(scope="module")
+def files(
+    tmp_path_factory: pytest.TempPathFactory, random_weights: dict[str, Path]
+) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("networks")
+    torch.manual_seed(0)
+    return {
+        "netvlad": random_weights["netvlad-pitts30k"],
+        "openibl": random_weights["openibl"],
+        "apgem": write_apgem(folder),
+        "delg": write_delg(folder),
+        "megaloc": write_megaloc(folder),
+    }
 
+
+@pytest.fixture
+def make(files: dict[str, Path]) -> Make:
     def build(name: str, **options: object) -> GlobalNetwork[Any]:
-        if name not in FILES:
-            torch.manual_seed(0)
-            FILES[name] = WRITERS[name](tmp_path_factory.mktemp(name))
-        given = {"device": "cpu", "weights": str(FILES[name]), **CHOSEN.get(name, {}), **options}
-        return KINDS[name](KINDS[name].Options.model_validate(given))
+        return plugin(KINDS[name], **{"weights": files[name], **CHOSEN.get(name, {}), **options})
 
     return build
 
 
-def seen(plugin: GlobalNetwork[Any], *images: Image) -> torch.Tensor:
-    """Return the network's input of images."""
-    return torch.cat([plugin._seen(image, torch.device("cpu")) for image in images])
+def seen(network: GlobalNetwork[Any], *images: Image) -> torch.Tensor:
+    return torch.cat([network._seen(image, torch.device("cpu")) for image in images])
 
 
 def test_vectors_equal_the_network(name: str, make: Make) -> None:
-    plugin = make(name)
+    network = make(name)
     images = [texture(49, 67, seed, sigma_px=6.0) for seed in range(2)]
-    many = plugin.describe_many(images)
-    assert len(pickle.dumps(plugin)) < 10_000  # without the network
+    many = network.describe_many(images)
+    assert len(pickle.dumps(network)) < 10_000  # without the network
     size, apart = SIZES[name]
     assert many.shape == (2, size) and many.dtype == np.float32
     assert np.abs(many[0] - many[1]).max() > apart
-    net, _ = plugin.network(plugin._load, *plugin._load_with)
+    net, _ = network.network(network._load, *network._load_with)
     with torch.inference_mode():
-        np.testing.assert_allclose(many, net(seen(plugin, *images)).numpy(), atol=1e-5)
+        np.testing.assert_allclose(many, net(seen(network, *images)).numpy(), atol=1e-5)
 
 
-def test_missing_weights_and_weights_of_another_network_are_refused(
-    make: Make, tmp_path: Path
-) -> None:
+def test_missing_and_unsuitable_weights_are_refused(make: Make, tmp_path: Path) -> None:
     for name, kind in KINDS.items():
         with pytest.raises(MissingWeightsError, match=name):
             kind()
@@ -167,9 +156,7 @@ def test_missing_weights_and_weights_of_another_network_are_refused(
         ("megaloc", {"size_px": 448}, "megaloc-small-448px"),
     ],
 )
-def test_names_identify_comparable_vectors(
-    make: Make, name: str, options: dict[str, object], expected: str
-) -> None:
+def test_names_identify_vectors(make: Make, name: str, options: Any, expected: str) -> None:
     assert make(name, **options).name == expected
 
 
@@ -225,9 +212,7 @@ def test_delg_reduces_like_pillow(make: Make) -> None:
     np.testing.assert_array_equal(result.numpy(), np.asarray(pillow))
 
 
-def test_overflow_in_half_precision_falls_back_to_full(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_half_precision_falls_back_at_overflow(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[bool] = []
 
     class Overflowing(VggNetVlad):
@@ -253,11 +238,11 @@ def test_an_image_too_small_for_vgg_is_refused(make: Make) -> None:
     assert make("netvlad").describe(random_image(16, 17)).shape == (12,)
 
 
-def test_apgem_whitens(make: Make) -> None:
+def test_apgem_whitens(make: Make, files: dict[str, Path]) -> None:
     image = texture(49, 67)
     plain = make("apgem").describe(image)
     result = make("apgem", whitening="Landmarks_clean").describe(image)
-    parts = torch.load(FILES["apgem"], weights_only=True)
+    parts = torch.load(files["apgem"], weights_only=True)
     whiten = whitening_from(parts, "Landmarks_clean", "w.pt")
     with torch.inference_mode():
         whitened = torch.nn.functional.normalize(whiten(torch.from_numpy(plain)[None]))[0]

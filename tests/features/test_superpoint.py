@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from images import texture
-from published import Tensors, random_tensors
+from published import Tensors, plugin, random_tensors
 from torch.nn import functional
 from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
@@ -17,7 +17,6 @@ from megloc_kapture.features import superpoint
 from megloc_kapture.features.superpoint import (
     SuperPoint,
     SuperPointNet,
-    SuperPointOptions,
     gray_tensor,
     sample_descriptors,
     superpoint_from,
@@ -27,21 +26,16 @@ from megloc_kapture.io.weights import find_weights
 CPU = torch.device("cpu")
 
 
-def extractor(weights: Path, **options: object) -> SuperPoint:
-    given = {"weights": str(weights), "device": "cpu", **options}
-    return SuperPoint(SuperPointOptions.model_validate(given))
-
-
-def test_borders_hold_no_keypoints_and_the_threshold_keeps_the_best(
-    superpoint_weights: Path,
-) -> None:
+def test_borders_hold_no_keypoints_and_a_threshold_keeps_the_best(superpoint_weights: Path) -> None:
     image = texture(80, 107, sigma_px=1.5)
-    result = extractor(superpoint_weights).extract(image)
+    result = plugin(SuperPoint, superpoint_weights).extract(image)
     assert len(result.scores) > 30
     assert result.keypoints_px[:, :2].min() >= 4.5
     # width and height are cut to multiples of 8
     assert (result.keypoints_px[:, :2].max(axis=0) <= np.array([104, 80]) - 4.5).all()
-    strong = extractor(superpoint_weights, threshold=float(result.scores[20])).extract(image)
+    strong = plugin(SuperPoint, superpoint_weights, threshold=float(result.scores[20])).extract(
+        image
+    )
     np.testing.assert_array_equal(strong.keypoints_px, result.keypoints_px[:20])
 
 
@@ -58,7 +52,7 @@ def test_keypoints_equal_transformers(
 ) -> None:
     monkeypatch.setattr(superpoint, "_BORDER_PX", 0)
     image = texture(height, width, sigma_px=1.5)
-    result = extractor(superpoint_weights, max_keypoints=100).extract(image)
+    result = plugin(SuperPoint, superpoint_weights, max_keypoints=100).extract(image)
     state = torch.load(superpoint_weights, weights_only=True)
     model = transformers_model(state, border_removal_distance=0, max_keypoints=100, nms_radius=4)
     with torch.inference_mode():
@@ -78,20 +72,18 @@ def test_gray_is_luma_rounded_to_eight_bits() -> None:
     assert np.abs(levels - luma).max() < 0.51  # cv2 counts in fixed point
 
 
-def test_the_batch_norm_variant_is_recognised_by_its_keys(
-    superpoint_weights: Path, tmp_path: Path
-) -> None:
+def test_the_batch_norm_variant_is_recognised(superpoint_weights: Path, tmp_path: Path) -> None:
     path = tmp_path / "superpoint_v6_from_tf.pth"
     torch.save(random_tensors("superpoint-batchnorm"), path)
     image = texture(64, 80, sigma_px=1.5)
-    plugin = extractor(path)
-    assert plugin.name == "superpoint-v6_from_tf"
-    official = plugin.extract(image)
-    exact = extractor(path, descriptor_sampling="exact").extract(image)
+    batchnorm = plugin(SuperPoint, path)
+    assert batchnorm.name == "superpoint-v6_from_tf"
+    official = batchnorm.extract(image)
+    exact = plugin(SuperPoint, path, descriptor_sampling="exact").extract(image)
     np.testing.assert_array_equal(official.descriptors, exact.descriptors)
     assert len(official.scores) > 10
     with pytest.raises(OptionError, match="descriptor_weights"):
-        extractor(path, descriptor_weights=str(superpoint_weights)).extract(image)
+        plugin(SuperPoint, path, descriptor_weights=str(superpoint_weights)).extract(image)
 
 
 BACKBONE = ("conv1", "conv2", "conv3", "conv4")

@@ -1,4 +1,4 @@
-"""Guided pyramid matching on arrays: positions of extracted keypoints, verification of matches."""
+"""Guided pyramid: keypoints of variants, their verification, and matches combined with theirs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from images import blobs
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError, PluginError
@@ -25,6 +26,7 @@ from megloc_kapture.matching.guided_pyramid import (
     pyramid_type,
 )
 from megloc_kapture.matching.nearest_neighbours import match_nearest
+from megloc_kapture.matching.pyramid_combination import SAME_KEYPOINT_PX, KeypointUnion, combine
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
@@ -76,19 +78,11 @@ def test_wrong_options_are_refused(name: str, values: list[Any]) -> None:
             GuidedPyramidOptions(**{name: value})
 
 
-def blobs() -> tuple[np.ndarray, np.ndarray]:
-    """Return an image of round spots and their centres."""
-    rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(np.arange(40, 300, 54), np.arange(40, 220, 54)), axis=-1)
-    centers = grid.reshape(-1, 2) + rng.uniform(-5, 5, (grid.size // 2, 2))
-    columns, rows = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
-    image = np.full((240, 320), 60.0)
-    for x, y in centers:
-        image += 160 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 6.0**2))
-    return np.repeat(np.round(image).astype(np.uint8)[..., None], 3, axis=2), centers
+GRID = np.stack(np.meshgrid(np.arange(40, 300, 54), np.arange(40, 220, 54)), axis=-1).reshape(-1, 2)
+CENTRES = GRID + np.random.default_rng(0).uniform(-5, 5, GRID.shape)
+IMAGE = blobs(CENTRES, 6.0, amplitude=160.0, size=(240, 320))
 
 
-IMAGE, CENTERS = blobs()
 # rounding causes weak keypoints on smooth spots
 SIFT = RootSift(RootSiftOptions(contrast_threshold=0.05))
 ITSELF = SIFT.extract(IMAGE)
@@ -209,9 +203,7 @@ ROWS = np.stack([np.arange(60)] * 2, axis=1)
 @pytest.mark.parametrize("scale", [1 / 3, 3.0])
 # both measurements share the error: it counts e / sqrt(2)
 @pytest.mark.parametrize(("error_px", "good"), [(5.5, True), (5.8, False)])
-def test_known_poses_count_in_pixels_of_the_original(
-    scale: float, error_px: float, good: bool
-) -> None:
+def test_known_poses_count_in_original_pixels(scale: float, error_px: float, good: bool) -> None:
     px, other_px, other_from_image = two_views(error_px)
     rays = bearing_rays(CAMERA, other_px)
     slopes = ray_slopes(CAMERA, other_px, rays)
@@ -289,9 +281,7 @@ def test_pixels_are_mapped_to_their_positions_in_the_original(scale: float, rota
     variant=st.builds(ImageVariant, st.floats(0.1, 3.0), st.sampled_from((0, 90, 180, 270))),
     seed=st.integers(0, 100),
 )
-def test_a_masks_pixel_is_true_if_all_covered_pixels_are(
-    size: tuple[int, int], variant: ImageVariant, seed: int
-) -> None:
+def test_a_masks_pixel_needs_all_it_covers(size: Any, variant: ImageVariant, seed: int) -> None:
     width, height = size
     mask = np.random.default_rng(seed).random((height, width)) > 0.1
     changed = variant.of_mask(mask)
@@ -313,3 +303,134 @@ def test_the_identity_changes_nothing() -> None:
     assert not ImageVariant(1.0, 90).is_identity and not ImageVariant(0.5).is_identity
     # a small image keeps a pixel
     assert ImageVariant(0.1).of_image(np.zeros((2, 30, 3), np.uint8)).shape == (1, 3, 3)
+
+
+Positions = list[tuple[float, float]]
+# a grid of quarter pixels: distances of exactly one pixel, and equal ones, are common
+POSITIONS = st.lists(
+    st.tuples(st.integers(-20, 20), st.integers(-20, 20)).map(lambda xy: (xy[0] / 4, xy[1] / 4)),
+    max_size=25,
+)
+
+
+def array(positions: Positions) -> np.ndarray:
+    xy = np.array(positions, np.float32).reshape(-1, 2)
+    return np.concatenate([xy, np.arange(len(xy), dtype=np.float32)[:, None]], axis=1)
+
+
+DESCRIPTOR = np.zeros(4, np.float32)
+
+
+def union_of(base: np.ndarray, added: np.ndarray) -> KeypointUnion:
+    union = KeypointUnion(base)
+    for keypoint in added:
+        union.append(keypoint, DESCRIPTOR)
+    return union
+
+
+def nearest(keypoint: np.ndarray, among: np.ndarray) -> int:
+    if len(among) == 0:
+        return -1
+    distance = np.linalg.norm(among[:, :2].astype(np.float64) - keypoint[:2], axis=1)
+    row = int(distance.argmin())
+    return row if distance[row] <= SAME_KEYPOINT_PX else -1
+
+
+@given(base=POSITIONS, more=POSITIONS)
+def test_the_union_equals_a_search_of_all_keypoints(base: Positions, more: Positions) -> None:
+    union = KeypointUnion(array(base))
+    kept = array(base)
+    for keypoint in array(more):
+        expected = nearest(keypoint, kept[: len(base)])  # the base comes first
+        if expected < 0:
+            behind = nearest(keypoint, kept[len(base) :])
+            expected = behind if behind < 0 else behind + len(base)
+        (result,) = union.find(keypoint[None]).tolist()
+        assert result == expected
+        if result < 0:
+            assert union.append(keypoint, DESCRIPTOR) == len(kept)
+            kept = np.concatenate([kept, keypoint[None]])
+    assert len(union) == len(kept)
+    np.testing.assert_array_equal(union.added(), kept[len(base) :])
+    assert union.find(np.zeros((0, 3), np.float32)).shape == (0,)
+    # a union with the added keypoints finds the same
+    again = union_of(array(base), union.added())
+    np.testing.assert_array_equal(again.find(array(more)), union.find(array(more)))
+
+
+@given(base=POSITIONS, more=POSITIONS, taken_back=st.integers(0, 25))
+def test_truncation_removes_keypoints(base: Positions, more: Positions, taken_back: int) -> None:
+    union = KeypointUnion(array(base))
+    for keypoint in array(more):
+        if union.find(keypoint[None])[0] < 0:
+            union.append(keypoint, DESCRIPTOR)
+    length = max(len(base), len(union) - taken_back)
+    expected = union_of(array(base), union.added()[: length - len(base)])
+    union.truncate(length)
+    np.testing.assert_array_equal(union.added(), expected.added())
+    assert len(union.descriptors) == len(union) - len(base)
+    np.testing.assert_array_equal(union.find(array(more)), expected.find(array(more)))
+
+
+def variant_matches(
+    positions: Positions, others: list[int], scores: list[float] | None = None
+) -> VariantMatches:
+    return VariantMatches(
+        ImageVariant(0.5),
+        np.array(positions, np.float32).reshape(-1, 2),
+        np.tile(np.arange(len(positions), dtype=np.float32)[:, None], (1, 4)),
+        np.array(others, np.int64),
+        np.array(scores or [1.0] * len(others), np.float32),
+    )
+
+
+def grid(count: int) -> np.ndarray:
+    return np.stack([np.arange(count) * 10.0, np.zeros(count)], axis=1).astype(np.float32)
+
+
+BASE = (np.array([[0, 0], [1, 1]]), np.array([0.9, 0.8]))
+
+
+def test_mode_all_adds_new_matches() -> None:
+    keypoints = KeypointUnion(grid(5))
+    tried = [
+        # at keypoint 2; new; new, but its partner is matched; at keypoint 1, which is matched
+        variant_matches([(20.5, 0.5), (5, 5), (6, 50), (10, 0)], [7, 8, 0, 9], [0.1, 0.2, 1, 1]),
+        variant_matches([(5, 5.9)], [10]),  # its keypoint equals (5, 5), which is matched
+    ]
+    matches, scores = combine(BASE, [(0, each) for each in tried], "all", [keypoints])
+    assert matches.tolist() == [[0, 0], [1, 1], [5, 8], [2, 7]]
+    np.testing.assert_allclose(scores, [0.9, 0.8, 0.2, 0.1])
+    np.testing.assert_array_equal(keypoints.descriptors, [tried[0].descriptors[1]])
+    np.testing.assert_array_equal(keypoints.added(), [(5, 5)])
+
+
+def test_variants_of_both_images_add_to_both() -> None:
+    first, second = KeypointUnion(grid(3)), KeypointUnion(grid(4))
+    tried = [(0, variant_matches([(5, 5)], [3])), (1, variant_matches([(6, 6), (7, 60)], [2, 1]))]
+    matches, scores = combine(BASE, tried, "all", (first, second))
+    # the variant with more matches comes first; row 1 of the first image is matched
+    assert matches.tolist() == [[0, 0], [1, 1], [2, 4], [3, 3]]
+    for union, (_, variant) in zip((first, second), tried, strict=True):
+        np.testing.assert_array_equal(union.descriptors, variant.descriptors[:1])
+
+
+def test_mode_max_takes_the_variant_with_most_matches() -> None:
+    rich = variant_matches([(5, 5), (0, 0.5), (15, 5)], [0, 5, 6])
+    richer = variant_matches([(5, 45), (10, 40), (15, 45), (20, 40)], [0, 5, 6, 7])
+    keypoints = KeypointUnion(grid(5))
+    matches, scores = combine(BASE, [(0, rich), (0, richer)], "max", [keypoints])
+    assert matches.tolist() == [[5, 0], [6, 5], [7, 6], [8, 7]]
+    matches, scores = combine(BASE, [(0, rich)], "max", [KeypointUnion(grid(5))])
+    assert matches.tolist() == [[5, 0], [0, 5], [6, 6]]
+
+
+def test_mode_max_keeps_the_base_unless_a_variant_has_more() -> None:
+    keypoints = KeypointUnion(grid(5))
+    # as many matches; three matches, two of which share a keypoint
+    some = variant_matches([(5, 5), (15, 5)], [4, 5])
+    seemingly = variant_matches([(5, 5), (5, 5.5), (15, 5)], [4, 5, 6])
+    for tried in ([], [(0, some)], [(0, seemingly)]):
+        matches, scores = combine(BASE, tried, "max", [keypoints])
+        assert matches.tolist() == BASE[0].tolist()
+        assert not keypoints.descriptors and len(keypoints) == 5

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
+from published import plugin, random_features, seen_again, superglue_input
 from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperPointConfig
 
 from megloc_kapture.errors import DataError
@@ -26,48 +26,14 @@ from megloc_kapture.matching.networks import (
 from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 from megloc_kapture.nets.kornia_networks import load_lighterglue
 from megloc_kapture.nets.superglue import (
-    ImageKeypoints,
     SuperGlueNet,
     mutual_matches,
-    normalise_keypoints,
     superglue,
 )
 from megloc_kapture.values import ImageFeatures
 from tests.matching import published_lightglue as published
 
 LAYERS = 2  # of nine: each costs the same
-
-
-def matcher(kind: Any, weights: Path, **options: float) -> Any:
-    given = {"weights": str(weights), "device": "cpu", **options}
-    return kind(kind.Options.model_validate(given))
-
-
-def unit(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    return (values / np.linalg.norm(values, axis=1, keepdims=True)).astype(np.float32)
-
-
-def features(number: int, size: int, seed: int) -> ImageFeatures:
-    """Return keypoints (N, 3) with scores, at random, and descriptors of a size."""
-    rng = np.random.default_rng(seed)
-    xy = 0.5 + rng.random((number, 2)) * (639, 479)
-    table = np.column_stack([xy, rng.uniform(0.01, 1, number)]).astype(np.float32)
-    return ImageFeatures(table, unit(rng.normal(size=(number, size))), 640, 480)
-
-
-def seen_again(
-    first: ImageFeatures, seed: int, *, kept: int | None = None, new: int = 40, noise: float = 0.02
-) -> ImageFeatures:
-    """Return the first keypoints with noisy descriptors, and new ones, in another order."""
-    rng = np.random.default_rng(seed)
-    table, descriptors = first.keypoints_px[:kept], first.descriptors[:kept]
-    others = features(new, descriptors.shape[1], seed + 100)
-    noisy = unit(descriptors + noise * rng.normal(size=descriptors.shape))
-    order = rng.permutation(len(noisy) + new)
-    table = np.concatenate([table, others.keypoints_px])[order]
-    return replace(
-        first, keypoints_px=table, descriptors=np.concatenate([noisy, others.descriptors])[order]
-    )
 
 
 @pytest.fixture(scope="module")
@@ -86,22 +52,13 @@ def superglue_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_matches_equal_the_networks_on_normalised_pixels(superglue_weights: Path) -> None:
-    a = features(80, 64, 0)
+    a = random_features(80, 64, 0)
     b = replace(seen_again(a, 1, kept=30, new=30, noise=0.0375), width=800, height=500)
-    matches, scores = matcher(SuperGlue, superglue_weights).match(a, b)
+    matches, scores = plugin(SuperGlue, superglue_weights).match(a, b)
     net = superglue(torch.load(superglue_weights, weights_only=True), "w").eval()
-    sides = [
-        ImageKeypoints(
-            normalise_keypoints(
-                torch.from_numpy(side.keypoints_px[:, :2]) - 0.5, side.width, side.height
-            ),
-            torch.from_numpy(side.keypoints_px[:, 2]),
-            torch.from_numpy(side.descriptors),
-        )
-        for side in (a, b)
-    ]
     with torch.inference_mode():
-        expected, expected_scores = mutual_matches(net([(sides[0], sides[1])], 100)[0], 0.2)
+        assignment = net([(superglue_input(a), superglue_input(b))], 100)[0]
+        expected, expected_scores = mutual_matches(assignment, 0.2)
     np.testing.assert_array_equal(matches, expected.numpy())
     np.testing.assert_array_equal(scores, expected_scores.numpy())
     assert matches.dtype == np.int64 and scores.dtype == np.float32
@@ -111,42 +68,43 @@ def test_matches_equal_the_networks_on_normalised_pixels(superglue_weights: Path
     assert (np.diff(matches[:, 0]) > 0).all()
     assert scores.min() > 0.2
     median = float(np.median(scores))
-    strict, _ = matcher(SuperGlue, superglue_weights, match_threshold=median).match(a, b)
+    strict, _ = plugin(SuperGlue, superglue_weights, match_threshold=median).match(a, b)
     assert 0 < len(strict) < len(matches)
 
 
 def test_matches_of_many_images_equal_those_of_single_pairs(superglue_weights: Path) -> None:
-    a = features(80, 64, 0)
+    a = random_features(80, 64, 0)
     again = seen_again(a, 1, kept=30), seen_again(a, 3, kept=45, new=45)
-    others = [again[0], features(0, 64, 2), again[1], features(1, 64, 4)]
-    plugin = matcher(SuperGlue, superglue_weights)
-    alone = [plugin.match(a, other) for other in others]
-    for (matches, scores), result in zip(alone, plugin.match_many(a, others), strict=True):
+    others = [again[0], random_features(0, 64, 2), again[1], random_features(1, 64, 4)]
+    network = plugin(SuperGlue, superglue_weights)
+    alone = [network.match(a, other) for other in others]
+    for (matches, scores), result in zip(alone, network.match_many(a, others), strict=True):
         np.testing.assert_array_equal(result[0], matches)
         np.testing.assert_allclose(result[1], scores, atol=1e-5)
     assert len(alone[0][0]) > 15 and len(alone[2][0]) > 15
-    assert plugin.match_many(a, []) == []
-    nothing = ImageFeatures(np.zeros((0, 3), np.float32), np.zeros((0, 0)), 640, 480)
-    for first, second in ((features(0, 64, 0), a), (a, features(0, 64, 0)), (nothing, a)):
-        matches, scores = plugin.match(first, second)
+    assert network.match_many(a, []) == []
+    empty = random_features(0, 64, 0)
+    nothing = replace(empty, descriptors=np.zeros((0, 0)))
+    for first, second in ((empty, a), (a, empty), (nothing, a)):
+        matches, scores = network.match(first, second)
         assert matches.shape == (0, 2) and matches.dtype == np.int64
         assert scores.shape == (0,) and scores.dtype == np.float32
 
 
 def test_unusable_features_are_named(superglue_weights: Path) -> None:
-    good = features(9, 64, 0)
-    plugin = matcher(SuperGlue, superglue_weights)
+    good = random_features(9, 64, 0)
+    network = plugin(SuperGlue, superglue_weights)
     bare = ImageFeatures(good.keypoints_px[:, :2], good.descriptors, 640, 480)
     with pytest.raises(DataError, match=r"x, y, score.*\(9, 2\) \(superpoint"):
-        plugin.match(good, bare)
+        network.match(good, bare)
     for value in (0.0, 1.5, -0.2, np.nan):
         table = good.keypoints_px.copy()
         table[4, 2] = value
         with pytest.raises(DataError, match=f"score as third column.*has {value:g}"):
-            plugin.match(ImageFeatures(table, good.descriptors, 640, 480), good)
+            network.match(ImageFeatures(table, good.descriptors, 640, 480), good)
     short = ImageFeatures(good.keypoints_px, good.descriptors[:, :32], 640, 480)
     with pytest.raises(DataError, match=r"small\.pth.*64 dimensions.*\(9, 32\)"):
-        plugin.match(good, short)
+        network.match(good, short)
 
 
 FULL = {"depth_confidence": -1.0, "width_confidence": -1.0}
@@ -175,7 +133,6 @@ def transformers_network() -> LightGlueForKeypointMatching:
 
 
 def official_of(network: LightGlueForKeypointMatching) -> dict[str, torch.Tensor]:
-    """Return the network's tensors by the keys of the published files."""
     tensors = {"posenc.Wr.weight": network.positional_encoder.projector.weight}
 
     def add(name: str, layer: torch.nn.Module) -> None:
@@ -212,14 +169,14 @@ def test_matches_equal_the_published_code(setting: int, tmp_path: Path) -> None:
     torch.save(published.tensors(), tmp_path / "random.pth")
     depth, width = published.CONFIDENCES[setting]
     confidences = {"depth_confidence": depth, "width_confidence": width}
-    plugin = matcher(LightGlue, tmp_path / "random.pth", **confidences)
+    network = plugin(LightGlue, tmp_path / "random.pth", **confidences)
     with np.load(published.DATA) as data:
         for pair in range(len(published.PAIRS)):
             images = [
                 ImageFeatures(xy + np.float32(0.5), descriptors, *published.IMAGE_SIZE)
                 for xy, descriptors in published.features(pair)
             ]
-            matches, scores = plugin.match(*images)
+            matches, scores = network.match(*images)
             layers, dropped = data[f"stop_{setting}_{pair}"]
             assert (layers < published.LAYERS) == (depth > 0) and (dropped > 0) == (width > 0)
             np.testing.assert_array_equal(matches, data[f"matches_{setting}_{pair}"])
@@ -230,7 +187,7 @@ def test_matches_equal_the_published_code(setting: int, tmp_path: Path) -> None:
 def test_matches_equal_transformers(tmp_path: Path) -> None:
     network = transformers_network()
     torch.save(official_of(network), tmp_path / "superpoint_lightglue.pth")
-    a = features(190, 256, 1)  # both images have as many: theirs is one tensor
+    a = random_features(190, 256, 1)  # both images have as many: theirs is one tensor
     first = replace(a, keypoints_px=a.keypoints_px[:150], descriptors=a.descriptors[:150])
     b = seen_again(first, 2)
     points = np.stack([a.keypoints_px[:, :2], b.keypoints_px[:, :2]]) - np.float32(0.5)
@@ -244,7 +201,7 @@ def test_matches_equal_transformers(tmp_path: Path) -> None:
         )
     rows = torch.nonzero(partner[0] > -1)[:, 0]
     expected = torch.stack([rows, partner[0, rows].long()], dim=1).numpy()
-    matches, scores = matcher(LightGlue, tmp_path / "superpoint_lightglue.pth", **FULL).match(a, b)
+    matches, scores = plugin(LightGlue, tmp_path / "superpoint_lightglue.pth", **FULL).match(a, b)
     assert len(matches) > 50 and scores.min() < 0.5 < scores.max()
     np.testing.assert_array_equal(matches, expected)
     np.testing.assert_allclose(scores, their_scores[0, rows].numpy(), atol=1e-4)
@@ -257,13 +214,13 @@ def test_unused_tensors_may_be_added_or_missing(tmp_path: Path) -> None:
         for key, value in tensors.items()
         if not key.startswith(("token_confidence", "log_assignment.0"))
     }
-    image = features(60, 128, 1)
+    image = random_features(60, 128, 1)
     result = []
     # DISK's file has further tensors
     for each in (tensors, used, tensors | {"log_assignment.0.r": torch.zeros(1)}):
         torch.save(each, tmp_path / f"{len(each)}.pth")
-        plugin = matcher(LightGlue, tmp_path / f"{len(each)}.pth", **FULL)
-        result.append(plugin.match(image, image))
+        network = plugin(LightGlue, tmp_path / f"{len(each)}.pth", **FULL)
+        result.append(network.match(image, image))
     for matches, scores in result[1:]:
         np.testing.assert_array_equal(matches, result[0][0])
         np.testing.assert_array_equal(scores, result[0][1])
@@ -287,9 +244,9 @@ def test_mismatched_weights_are_named(tmp_path: Path, key: str, kept: Any, messa
     if kept is not None:
         tensors[key] = value[kept].clone()
     torch.save(tensors, tmp_path / "it.pth")
-    image = features(3, 128, 0)
+    image = random_features(3, 128, 0)
     with pytest.raises(DataError, match=rf"it\.pth: .*{message}"):
-        matcher(LightGlue, tmp_path / "it.pth", **FULL).match(image, image)
+        plugin(LightGlue, tmp_path / "it.pth", **FULL).match(image, image)
 
 
 @pytest.fixture(scope="module")
@@ -301,13 +258,13 @@ def test_most_matches_of_a_real_pair_are_right(
     lighterglue_weights: str, shared_data: Path, fountain: Path
 ) -> None:
     folder, names = KaptureFolder(fountain / "mapping"), ("0002.jpg", "0003.jpg")
-    extractor = matcher(XFeat, shared_data / "weights/xfeat/xfeat.pt", max_keypoints=1000)
+    extractor = plugin(XFeat, shared_data / "weights/xfeat/xfeat.pt", max_keypoints=1000)
     both = []
     for name in names:
         image = read_image_rgb(folder.image_path(name))
         local = extractor.extract(image)
         both.append(ImageFeatures(local.keypoints_px, local.descriptors, *image.shape[1::-1]))
-    matches, scores = matcher(LighterGlue, lighterglue_weights).match(*both)
+    matches, scores = plugin(LighterGlue, lighterglue_weights).match(*both)
     assert matches.dtype == np.int64 and scores.dtype == np.float32
     data, seen = folder.read(), []
     for side, image in enumerate(both):
@@ -321,32 +278,30 @@ def test_most_matches_of_a_real_pair_are_right(
 
 
 def test_the_order_of_keypoints_does_not_matter(lighterglue_weights: str) -> None:
-    a = features(200, 64, 3)
+    a = random_features(200, 64, 3)
     rim = a.keypoints_px.copy()
     rim[:3, :2] = [[0.0, 0.0], [0.2, 479.9], [640.0, 480.0]]  # clamped: kornia refuses them
     a = replace(a, keypoints_px=rim)
     b = seen_again(a, 4, new=0, noise=0.0)
-    matches, scores = matcher(LighterGlue, lighterglue_weights).match(a, b)
+    matches, scores = plugin(LighterGlue, lighterglue_weights).match(a, b)
     assert len(matches) > 150 and (np.diff(matches[:, 0]) > 0).all()
     np.testing.assert_array_equal(a.descriptors[matches[:, 0]], b.descriptors[matches[:, 1]])
     assert len(np.unique(matches[:, 1])) == len(matches)
-    back, back_scores = matcher(LighterGlue, lighterglue_weights).match(b, a)
+    back, back_scores = plugin(LighterGlue, lighterglue_weights).match(b, a)
     assert {*map(tuple, back[:, ::-1].tolist())} == {*map(tuple, matches.tolist())}
     np.testing.assert_allclose(np.sort(scores), np.sort(back_scores), atol=1e-4)
 
 
-def test_mismatched_weights_of_lighterglue_are_named(
-    lighterglue_weights: str, shared_data: Path
-) -> None:
+def test_mismatched_lighterglue_is_named(lighterglue_weights: str, shared_data: Path) -> None:
     tensors = read_weights(find_weights(lighterglue_weights))
     for key in ("extractor.head.weight", "optimizer.step", "matcher.extra"):
         unknown = key.removeprefix("matcher.")
         with pytest.raises(DataError, match=rf"l\.pt: .*1 unexpected keys: {unknown}$"):
             load_lighterglue({**tensors, key: torch.zeros(1)}, "l.pt")
     other = str(shared_data / "weights" / "aliked" / "aliked-t16.pth")
-    image = features(3, 64, 0)
+    image = random_features(3, 64, 0)
     with pytest.raises(DataError, match=r"aliked-t16\.pth: .*it has no layers"):
-        matcher(LighterGlue, other).match(image, image)
+        plugin(LighterGlue, other).match(image, image)
     wide = replace(image, descriptors=np.zeros((3, 128), np.float32))
     with pytest.raises(DataError, match="descriptors of 64 dimensions, but the features have 128"):
-        matcher(LighterGlue, lighterglue_weights).match(image, wide)
+        plugin(LighterGlue, lighterglue_weights).match(image, wide)

@@ -104,9 +104,7 @@ def test_repeated_structure_is_no_contradiction() -> None:
 
 @pytest.mark.parametrize(("num", "contradicts"), [((30, 30), False), ((42, 42), False),
                                                   ((60, 60), True)])  # fmt: skip
-def test_pairs_that_may_only_look_alike_weigh_little(
-    num: tuple[int, int], contradicts: bool
-) -> None:
+def test_pairs_that_may_look_alike_weigh_little(num: tuple[int, int], contradicts: bool) -> None:
     """Pairs usually have 80 matches; the last image has 90 that fit in one pair, ``num`` do not."""
     right = poses_around(4)
     pairs = evidence(right, right)

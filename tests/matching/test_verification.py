@@ -35,7 +35,6 @@ def undistorted(rays: Array, focal_px: float) -> tuple[Array, Array]:
 
 
 def seen(camera: Camera, pixels: Array) -> tuple[Array, Array]:
-    """Return rays and slopes of pixels."""
     rays = bearing_rays(camera, pixels)
     return rays, ray_slopes(camera, pixels, rays)
 
@@ -102,9 +101,7 @@ def smallest_correction_px(
 @pytest.mark.parametrize(
     ("camera_a", "camera_b"), [(WIDE[0], PINHOLE), (WIDE[1], WIDE[0])], ids=["pinhole", "fisheye"]
 )
-def test_the_error_is_that_of_optimal_triangulation_to_first_order(
-    camera_a: Camera, camera_b: Camera
-) -> None:
+def test_the_error_is_that_of_optimal_triangulation(camera_a: Camera, camera_b: Camera) -> None:
     rng = np.random.default_rng(7)
     points, in_a, in_b = scene(camera_a, camera_b, count=8)
     in_a, in_b = in_a + rng.normal(size=in_a.shape), in_b + rng.normal(size=in_b.shape)
@@ -243,16 +240,13 @@ def of_one_scene(number: int, share: float, seed: int) -> tuple[Array, Array]:
     return first, second
 
 
-@pytest.mark.parametrize("number", [40, 600])
-def test_random_matches_agree_by_chance(number: int) -> None:
-    result = verified(*of_one_scene(number, 0.0, seed=0))
-    assert agree_by_chance(*result, OPTIONS), len(result[0])
-
-
-@pytest.mark.parametrize(("number", "share"), [(40, 0.8), (600, 0.2)])
-def test_matches_of_a_scene_do_not_agree_by_chance(number: int, share: float) -> None:
+@pytest.mark.parametrize(
+    ("number", "share", "by_chance"),
+    [(40, 0.0, True), (600, 0.0, True), (40, 0.8, False), (600, 0.2, False)],
+)
+def test_random_matches_agree_by_chance(number: int, share: float, by_chance: bool) -> None:
     result = verified(*of_one_scene(number, share, seed=1))
-    assert not agree_by_chance(*result, OPTIONS), len(result[0])
+    assert agree_by_chance(*result, OPTIONS) == by_chance, len(result[0])
     first, _, second, *_ = result
     assert agree_by_chance(first[:5], CAMERA, second[:5], CAMERA, 5, OPTIONS)  # a minimal sample
 

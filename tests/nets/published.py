@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 import runpy
 import zlib
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
+
+from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet
+from megloc_kapture.nets.superglue import ImageKeypoints, normalise_keypoints
+from megloc_kapture.values import ImageFeatures
 
 Net = TypeVar("Net", bound=nn.Module)
 Tensors = dict[str, torch.Tensor]
@@ -51,6 +56,53 @@ def delg_variables(kind: str) -> dict[str, NDArray[np.float32]]:
             values = random.uniform(low, high, shape)
         drawn[name] = np.asarray(values, np.float32)
     return drawn
+
+
+def plugin(kind: Any, weights: Path | str, **options: Any) -> Any:
+    given = {"weights": str(weights), "device": "cpu", **options}
+    return kind(kind.Options.model_validate(given))
+
+
+def unit(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    return (values / np.linalg.norm(values, axis=1, keepdims=True)).astype(np.float32)
+
+
+def random_features(number: int, size: int, seed: int) -> ImageFeatures:
+    """Return keypoints (N, 3) with scores, at random, and descriptors of a size."""
+    rng = np.random.default_rng(seed)
+    xy = 0.5 + rng.random((number, 2)) * (639, 479)
+    table = np.column_stack([xy, rng.uniform(0.01, 1, number)]).astype(np.float32)
+    return ImageFeatures(table, unit(rng.normal(size=(number, size))), 640, 480)
+
+
+def seen_again(
+    first: ImageFeatures, seed: int, *, kept: int | None = None, new: int = 40, noise: float = 0.02
+) -> ImageFeatures:
+    """Return the first keypoints with noisy descriptors, and new ones, in another order."""
+    rng = np.random.default_rng(seed)
+    table, descriptors = first.keypoints_px[:kept], first.descriptors[:kept]
+    others = random_features(new, descriptors.shape[1], seed + 100)
+    noisy = unit(descriptors + noise * rng.normal(size=descriptors.shape))
+    order = rng.permutation(len(noisy) + new)
+    table = np.concatenate([table, others.keypoints_px])[order]
+    return replace(
+        first, keypoints_px=table, descriptors=np.concatenate([noisy, others.descriptors])[order]
+    )
+
+
+def superglue_input(image: ImageFeatures) -> ImageKeypoints:
+    pixels = torch.from_numpy(image.keypoints_px[:, :2]) - 0.5
+    return ImageKeypoints(
+        normalise_keypoints(pixels, image.width, image.height),
+        torch.from_numpy(image.keypoints_px[:, 2]),
+        torch.from_numpy(image.descriptors),
+    )
+
+
+def small_megaloc() -> MegaLocNet:
+    trunk = DinoV2(channels=12, depth=2, heads=3, grid=7)
+    sizes = {"clusters": 5, "cluster_size": 4, "token_size": 6, "descriptor_size": 10}
+    return MegaLocNet(trunk, **sizes)
 
 
 def shapes_of(module: nn.Module) -> Shapes:

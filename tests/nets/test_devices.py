@@ -11,7 +11,7 @@ import pytest
 import torch
 from emulated_device import emulated_devices
 from numpy.typing import NDArray
-from published import randomised
+from published import random_features, randomised, seen_again
 from whole_preset_weights import Sizes, write_random_weights
 
 from megloc_kapture.features import global_networks
@@ -25,7 +25,6 @@ from megloc_kapture.localization import lpips
 from megloc_kapture.matching.networks import LightGlue, SuperGlue
 from megloc_kapture.nets import runtime
 from megloc_kapture.preprocessing.deeplab import DeepLab, DeepLabV3Plus
-from megloc_kapture.values import ImageFeatures
 
 DEVICE = "cuda:1"
 HEIGHT, WIDTH = 64, 96
@@ -139,18 +138,8 @@ def test_global_features(name: str, weights: Callable[..., None], image: NDArray
 @pytest.mark.parametrize("name", MATCHERS)
 def test_matches(name: str, weights: Callable[..., None]) -> None:
     weights(name)
-    rng = np.random.default_rng(0)
-
-    def features(number: int) -> ImageFeatures:
-        xy = rng.uniform(1, 60, (number, 2))
-        descriptors = rng.normal(size=(number, 256))
-        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-        table = np.column_stack([xy, rng.uniform(0.1, 1, number)]).astype(np.float32)
-        return ImageFeatures(table, descriptors.astype(np.float32), WIDTH, HEIGHT)
-
-    a, less, none = features(40), features(1), features(0)
-    order = rng.permutation(40)[:30]
-    b = ImageFeatures(a.keypoints_px[order], a.descriptors[order], WIDTH, HEIGHT)
+    a, less, none = (random_features(number, 256, number) for number in (40, 1, 0))
+    b = seen_again(a, 0, kept=30, new=0, noise=0.0)
     options = {"sinkhorn_iterations": 2} if name == "superglue_outdoor" else {}
     cpu, result = on_both(MATCHERS[name], options, lambda p: p.match_many(a, [b, less, none]))
     pairs = [set(map(tuple, matches.tolist())) for matches, _ in (cpu[0], result[0])]

@@ -1,4 +1,4 @@
-"""NetVLAD and AP-GeM against their equations, and whitening."""
+"""ResNet against transformers, NetVLAD and AP-GeM against their equations, and whitening."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from published import Tensors, published_shapes, randomised
 from torch.nn import functional as F
+from transformers import ResNetConfig, ResNetModel
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.nets.global_descriptors import (
@@ -18,7 +19,45 @@ from megloc_kapture.nets.global_descriptors import (
     openibl,
     whitening_from,
 )
-from megloc_kapture.nets.trunks import ResNet
+from megloc_kapture.nets.trunks import ResNet, generalized_mean
+
+
+def resnet_names(key: str) -> str:
+    parts = key.split(".")
+    kind = {"c": "convolution", "b": "normalization"}
+    if parts[0] in ("conv1", "bn1"):
+        return f"embedder.embedder.{kind[parts[0][0]]}.{parts[-1]}"
+    stage, block = int(parts[0][-1]) - 1, parts[1]
+    place = f"encoder.stages.{stage}.layers.{block}"
+    if parts[2] == "downsample":
+        part = "convolution" if parts[3] == "0" else "normalization"
+        return f"{place}.shortcut.{part}.{parts[4]}"
+    return f"{place}.layer.{int(parts[2][-1]) - 1}.{kind[parts[2][0]]}.{parts[3]}"
+
+
+def test_stages_equal_transformers() -> None:
+    ours = randomised(ResNet(50))
+    theirs = ResNetModel(ResNetConfig(depths=[3, 4, 6, 3], layer_type="bottleneck")).eval()
+    renamed = {resnet_names(key): value for key, value in ours.state_dict().items()}
+    theirs.load_state_dict(renamed, strict=True)
+    image = torch.randn(1, 3, 65, 98)
+    with torch.inference_mode():
+        result = ours(image)
+        expected = theirs(image, output_hidden_states=True).hidden_states[1:]
+    assert [f.shape[1] for f in result] == [256, 512, 1024, 2048]
+    for stage, other in zip(result, expected, strict=True):
+        assert other.std() > 0.1
+        torch.testing.assert_close(stage, other, rtol=1e-5, atol=1e-5 * float(other.abs().max()))
+
+
+def test_the_generalized_mean_clamps_small_values_and_does_not_overflow() -> None:
+    least = generalized_mean(torch.tensor([-5.0, 0.0, 1e-9]).view(1, 1, 1, 3), 3.0)
+    torch.testing.assert_close(least, torch.tensor([[1e-6]]))
+    # the third power of a half would overflow
+    large = generalized_mean(torch.full((1, 1, 2, 2), 500.0, dtype=torch.float16), 3.0)
+    assert large.dtype == torch.float32
+    torch.testing.assert_close(large, torch.tensor([[500.0]]))
+
 
 CLUSTERS, OUTPUT = 3, 10
 MEAN = (123.0, 116.5, 104.25)
@@ -59,9 +98,7 @@ def image() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("official", [True, False], ids=["netvlad", "openibl"])
-def test_netvlad_equals_its_layers_and_equation_four(
-    weights: Tensors, image: torch.Tensor, official: bool
-) -> None:
+def test_netvlad_is_equation_four(weights: Tensors, image: torch.Tensor, official: bool) -> None:
     if official:
         net = netvlad(weights | {AVERAGE_IMAGE: torch.tensor(MEAN)}, "w.mat")
         assert net.mean_rgb == MEAN and net.net_vlad.order == "dk"
@@ -111,7 +148,7 @@ def test_apgem_equals_its_steps(apgem_tensors: Tensors) -> None:
     mean, deviation = np.array([0.4, 0.5, 0.6]), np.array([0.2, 0.25, 0.3])
     image = torch.rand(1, 3, 75, 98, generator=torch.manual_seed(1))
     seen = (image.numpy() - mean[:, None, None]) / deviation[:, None, None]
-    trunk = ResNet(50).eval()  # compared with transformers' in test_trunks.py
+    trunk = ResNet(50).eval()  # compared with transformers' above
     trunk.load_state_dict(tensors, strict=False)
     with torch.inference_mode():
         features = trunk(torch.from_numpy(seen.astype(np.float32)))[-1].numpy()
@@ -134,9 +171,7 @@ def test_apgem_equals_its_steps(apgem_tensors: Tensors) -> None:
         np.testing.assert_allclose(result, expected, atol=1e-6)
 
 
-def test_apgem_uses_the_statistics_of_imagenet_unless_the_checkpoint_has_others(
-    apgem_tensors: Tensors,
-) -> None:
+def test_apgem_uses_imagenets_statistics_by_default(apgem_tensors: Tensors) -> None:
     net = apgem_from(apgem_tensors, "w.pt")
     assert net.mean.flatten().tolist() == pytest.approx([0.485, 0.456, 0.406])
     assert net.deviation.flatten().tolist() == pytest.approx([0.229, 0.224, 0.225])

@@ -7,30 +7,21 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from published import small_megaloc
 from torch.nn import functional
 from transformers import Dinov2Config, Dinov2Model
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.nets import megaloc
-from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet, Salad, assignment, megaloc_from, squared
+from megloc_kapture.nets.megaloc import DinoV2, Salad, assignment, megaloc_from, squared
 
 CHANNELS, CLUSTERS, SIZE, TOKEN = 6, 4, 5, 3  # of SALAD
 DINO_CHANNELS, DINO_DEPTH, DINO_HEADS, DINO_GRID = 24, 3, 4, 5
 
 
-def small() -> MegaLocNet:
-    return MegaLocNet(
-        DinoV2(channels=8, depth=2, heads=2, grid=5),
-        clusters=4,
-        cluster_size=3,
-        token_size=2,
-        descriptor_size=10,
-    )
-
-
 def test_the_vector_is_normalised_and_linear_in_the_aggregated_tokens() -> None:
     torch.manual_seed(0)
-    network = small().eval()
+    network = small_megaloc().eval()
     image = torch.rand(2, 3, 42, 56)
     mean, deviation = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])
     with torch.inference_mode():
@@ -48,14 +39,14 @@ def test_the_vector_is_normalised_and_linear_in_the_aggregated_tokens() -> None:
 @pytest.mark.parametrize("older", [False, True])
 def test_both_published_layouts_are_read(older: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(1)
-    kept = small()
+    kept = small_megaloc()
     tensors = dict(kept.state_dict())
     if older:
         trunk = [key for key in tensors if key.startswith("backbone.")]
         for key in trunk:
             tensors[key.replace("backbone.", "backbone.model.")] = tensors.pop(key)
-        tensors["backbone.model.mask_token"] = torch.zeros(1, 8)
-    monkeypatch.setattr(megaloc, "MegaLocNet", small)
+        tensors["backbone.model.mask_token"] = torch.zeros(1, 12)
+    monkeypatch.setattr(megaloc, "MegaLocNet", small_megaloc)
     network = megaloc_from(tensors, "w")
     assert not network.training
     for key, value in kept.state_dict().items():
@@ -139,7 +130,6 @@ def test_an_image_needs_more_patches_than_clusters() -> None:
 
 
 def small_trunk(seed: int = 0) -> DinoV2:
-    """A small trunk with random norms, layer scales and positions."""
     generator = torch.Generator().manual_seed(seed)
     net = DinoV2(channels=DINO_CHANNELS, depth=DINO_DEPTH, heads=DINO_HEADS, grid=DINO_GRID)
     with torch.no_grad():
@@ -151,7 +141,6 @@ def small_trunk(seed: int = 0) -> DinoV2:
 
 
 def as_transformers(net: DinoV2) -> Dinov2Model:
-    """The model of transformers with the same weights."""
     config = Dinov2Config(
         hidden_size=DINO_CHANNELS,
         num_hidden_layers=DINO_DEPTH,

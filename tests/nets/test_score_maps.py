@@ -22,10 +22,6 @@ from megloc_kapture.nets.score_maps import (
 Scores = NDArray[np.float32]
 
 
-def random_scores(seed: int, shape: tuple[int, int]) -> Scores:
-    return np.random.default_rng(seed).uniform(0.01, 1, shape).astype(np.float32)
-
-
 def by_definition(scores: Scores, radius: int, rounds: int) -> Scores:
     """The suppression as SuperGlue's authors describe it, with scipy's filters."""
 
@@ -42,7 +38,7 @@ def by_definition(scores: Scores, radius: int, rounds: int) -> Scores:
 
 @pytest.mark.parametrize(("radius", "rounds"), [(0, 2), (1, 0), (4, 2), (70, 1)])
 def test_suppression_equals_its_definition(radius: int, rounds: int) -> None:
-    scores = random_scores(radius, (47, 62))
+    scores = np.random.default_rng(radius).uniform(0.01, 1, (47, 62)).astype(np.float32)
     scores[10:14, 20:30] = 0.99  # equal neighbours
     result = suppress_non_maxima(torch.from_numpy(scores)[None], radius, rounds=rounds)
     np.testing.assert_array_equal(result[0].numpy(), by_definition(scores, radius, rounds))

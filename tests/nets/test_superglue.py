@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch.nn import functional
+from published import random_features, seen_again, superglue_input
 from transformers import SuperGlueConfig, SuperGlueForKeypointMatching
 from transformers.models.superglue.modeling_superglue import log_optimal_transport as in_logarithm
 
@@ -16,7 +16,6 @@ from megloc_kapture.nets.superglue import (
     SuperGlueNet,
     log_optimal_transport,
     mutual_matches,
-    normalise_keypoints,
     superglue,
 )
 
@@ -24,10 +23,10 @@ WIDTH, HEIGHT = 640, 480
 THRESHOLD = 0.2
 # a quarter of the published width, and 6 of 18 layers: the same code in a tenth of the time
 SIZE, ENCODER, LAYERS = 64, (8, 16, 32, 64, 64), 6
+NOISE = 0.7 / SIZE**0.5
 
 
 def peaky_weights() -> dict[str, torch.Tensor]:
-    """Random weights under the official keys."""
     generator = torch.Generator().manual_seed(0)
     result = {}
     for key, shape in SuperGlueNet(ENCODER, LAYERS).state_dict().items():
@@ -47,29 +46,6 @@ def peaky_weights() -> dict[str, torch.Tensor]:
     result["bin_score"] = torch.tensor(2.0)
     result["final_proj.weight"] = result["final_proj.weight"] + 7.0 * torch.eye(SIZE)[:, :, None]
     return result
-
-
-def random_image(num: int, seed: int) -> ImageKeypoints:
-    generator = torch.Generator().manual_seed(seed)
-    descriptors = functional.normalize(torch.randn((num, SIZE), generator=generator), dim=1)
-    pixels = torch.rand((num, 2), generator=generator) * torch.tensor([WIDTH - 1.0, HEIGHT - 1.0])
-    scores = 0.05 + 0.9 * torch.rand(num, generator=generator)
-    return ImageKeypoints(normalise_keypoints(pixels, WIDTH, HEIGHT), scores, descriptors)
-
-
-def seen_again(image: ImageKeypoints, num: int, num_new: int, seed: int) -> ImageKeypoints:
-    """Another view of the first keypoints, moved and noisy, mixed with new keypoints."""
-    generator = torch.Generator().manual_seed(seed)
-    new = random_image(num_new, seed + 1000)
-    noise = torch.randn((num, SIZE), generator=generator) / SIZE**0.5
-    order = torch.randperm(num + num_new, generator=generator)
-    moved = image.xy[:num] + 0.02 * torch.randn((num, 2), generator=generator)
-    noisy = functional.normalize(image.descriptors[:num] + 0.7 * noise, dim=1)
-    return ImageKeypoints(
-        torch.cat([moved, new.xy])[order],
-        torch.cat([image.scores[:num], new.scores])[order],
-        torch.cat([noisy, new.descriptors])[order],
-    )
 
 
 def transformers_model(weights: dict[str, torch.Tensor]) -> SuperGlueForKeypointMatching:
@@ -151,8 +127,8 @@ def net(weights: dict[str, torch.Tensor]) -> SuperGlueNet:
 
 @torch.inference_mode()
 def test_matches_equal_transformers(net: SuperGlueNet, weights: dict[str, torch.Tensor]) -> None:
-    a = random_image(150, 0)
-    b = seen_again(a, 110, 40, 0)
+    first = random_features(150, SIZE, 0)
+    a, b = map(superglue_input, (first, seen_again(first, 0, kept=110, noise=NOISE)))
     partner, scores = partners(net([(a, b)], 100)[0])
     expected, expected_scores = transformers_matches(transformers_model(weights), a, b)
     result = partner >= 0
@@ -163,13 +139,14 @@ def test_matches_equal_transformers(net: SuperGlueNet, weights: dict[str, torch.
 
 @torch.inference_mode()
 def test_a_batch_of_pairs_of_any_sizes_gives_the_matches_of_each_pair(net: SuperGlueNet) -> None:
-    a = random_image(150, 0)
-    pairs = [
-        (a, seen_again(a, 110, 40, 0)),
-        (a, random_image(1, 2)),
-        (random_image(3, 3), a),
-        (a, seen_again(a, 60, 30, 4)),
+    a = random_features(150, SIZE, 0)
+    features = [
+        (a, seen_again(a, 0, kept=110, noise=NOISE)),
+        (a, random_features(1, SIZE, 2)),
+        (random_features(3, SIZE, 3), a),
+        (a, seen_again(a, 4, kept=60, new=30, noise=NOISE)),
     ]
+    pairs = [(superglue_input(first), superglue_input(second)) for first, second in features]
     together = net(pairs, 100)
     for pair, result in zip(pairs, together, strict=True):
         alone = net([pair], 100)[0]
@@ -182,8 +159,8 @@ def test_a_batch_of_pairs_of_any_sizes_gives_the_matches_of_each_pair(net: Super
 
 @torch.inference_mode()
 def test_half_precision_ends_before_the_transport(net: SuperGlueNet) -> None:
-    a = random_image(150, 9)
-    b = seen_again(a, 110, 40, 10)
+    first = random_features(150, SIZE, 9)
+    a, b = map(superglue_input, (first, seen_again(first, 10, kept=110, noise=NOISE)))
     whole = net([(a, b)], 100)[0]
     with torch.autocast("cpu", dtype=torch.bfloat16):
         half = net([(a, b)], 100)[0]
@@ -199,9 +176,7 @@ def test_half_precision_ends_before_the_transport(net: SuperGlueNet) -> None:
 @pytest.mark.parametrize(
     ("scale", "iterations", "bin_score"), [(0.1, 1, 2.3), (10.0, 2, -300.0), (300.0, 100, 300.0)]
 )
-def test_optimal_transport_equals_the_log_domain_definition(
-    scale: float, iterations: int, bin_score: float
-) -> None:
+def test_transport_equals_transformers(scale: float, iterations: int, bin_score: float) -> None:
     scores = scale * torch.randn((60, 45), generator=torch.Generator().manual_seed(0))
     dustbin = torch.tensor(bin_score)
     expected = in_logarithm(scores[None].double(), dustbin.double(), iterations)[0]

@@ -22,14 +22,7 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def random_state(shapes):
-    """A state dict with random values that keep activations near 1.
-
-    Made of the generator's bits, which are the same under every version of numpy.
-
-    Parameters
-    ----------
-    shapes : key -> shape.
-    """
+    """Random values by key and shape that keep activations near 1, by any version of numpy."""
     state = {}
     for number, (key, shape) in enumerate(sorted(shapes.items())):
         if key.endswith("num_batches_tracked"):
