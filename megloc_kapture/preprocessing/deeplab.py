@@ -38,7 +38,7 @@ CITYSCAPES_CLASSES = (
     *("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"),
 )
 CITYSCAPES_DYNAMIC = frozenset(CITYSCAPES_CLASSES[11:])
-_MAX_SIZE_PX = 2048  # larger images are reduced to this longer side, that of Cityscapes
+_MAX_SIZE_PX = 2048  # larger images are reduced to this longer side, Cityscapes' image width
 _WIDTH = 256
 _LOW_LEVEL_WIDTH = 48
 _DILATIONS = (6, 12, 18)
@@ -95,7 +95,7 @@ def backbone_of(keys: Collection[str], where: str) -> Backbone:
         if key.startswith("backbone.low_level_features."):
             return "mobilenet"
     raise DataError(
-        "not DeepLabV3+: it needs keys backbone.layer1.* (ResNet-101) or "
+        "this file is not a DeepLabV3+ checkpoint: no keys backbone.layer1.* (ResNet-101) or "
         "backbone.low_level_features.* (MobileNetV2)",
         path=where,
     )

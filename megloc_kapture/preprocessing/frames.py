@@ -43,7 +43,7 @@ _ROUNDING_PX = 1e-6
 # tolerance for the residual of COLMAP's iterative undistortion
 _SAME_PX = 1e-3
 Floats = NDArray[np.float64]
-# in these models distortion is a polynomial (or a ratio of two) of the tangent of the angle, so
+# in these models distortion is a polynomial (or a ratio of two) in the tangent of the angle, so
 # zero coefficients mean no distortion (unlike in fisheye models)
 _POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
 Float32 = NDArray[np.float32]
@@ -71,12 +71,12 @@ def processed_image(image: NDArray[np.uint8], plan: FramePlan) -> NDArray[np.uin
 
 
 def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_]:
-    """Resample a mask to the processed image, (H, W), by nearest neighbours."""
+    """Resample a mask to the size (H, W) of the processed image, with nearest neighbours."""
     size = (plan.processed.height, plan.processed.width)
     if not plan.changes_pixels:
         return mask
     if not plan.warps:
-        # OpenCV's nearest neighbour is that of the pixel's corner, not of its centre
+        # OpenCV's nearest-neighbour resizing samples at a pixel's corner, not at its centre
         rows, columns = (
             (2 * np.arange(number) + 1) * old_side // (2 * side)
             for number, old_side, side in zip(size, mask.shape, plan.resized[::-1], strict=True)
@@ -122,7 +122,7 @@ def _grid(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> NDArray
 
 @lru_cache(maxsize=4)
 def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
-    """Return float32 x and y of samples; the first pixel's centre is (0, 0), as in OpenCV."""
+    """Return x and y, float32, where to sample the original; the first pixel's centre is (0, 0)."""
     import cv2
 
     width, height = plan.processed.width, plan.processed.height
@@ -188,7 +188,7 @@ def plan_frame(
     upscale: bool = False,
     undistort: bool = False,
 ) -> FramePlan:
-    """Plan size and projection of a camera's images, which by default do not change."""
+    """Plan the new size and projection of a camera's images; by default neither changes."""
     lens = undistorted_camera(camera) if undistort else camera
     warps = not same_lens(camera, lens)
     width, height = lens.width, lens.height
@@ -246,7 +246,7 @@ def fitted_size(
 
 
 def cropped_size(width: int, height: int) -> tuple[int, int]:
-    """Crop at the right and at the bottom to multiples of 8, as networks' feature maps need."""
+    """Return a size cropped to multiples of 8 at the right and bottom, as feature maps need."""
     if min(width, height) < _SIDE_STEP_PX:
         raise OptionError(
             f"an image of {width}x{height} cannot be cropped to multiples of {_SIDE_STEP_PX}"

@@ -69,7 +69,7 @@ def test_people_and_vehicles_are_dynamic() -> None:
 def test_the_backbone_is_recognised_by_the_keys() -> None:
     for backbone in ("resnet101", "mobilenet"):
         assert backbone_of(published_shapes(f"deeplabv3plus-{backbone}"), "w.pth") == backbone
-    with pytest.raises(DataError, match=r"w\.pth: not DeepLabV3\+"):
+    with pytest.raises(DataError, match=r"w\.pth: this file is not a DeepLabV3\+"):
         backbone_of(["conv1a.weight"], "w.pth")
 
 
