@@ -80,13 +80,13 @@ def with_two_focals(camera: Camera) -> Camera:
 
 
 def same_lens(first: Camera, second: Camera) -> bool:
-    """Return True for equal distortion models and parameters; all else may differ."""
+    """Return True for equal distortion models and coefficients; all else may differ."""
     a, b = with_two_focals(first), with_two_focals(second)
     return a.model == b.model and a.params[4:] == b.params[4:]
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """Scale a camera to sides of whole pixels; focal lengths and principal point follow them."""
+    """Scale a camera, with sides rounded to pixels; focal lengths and principal point follow."""
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     x, y = width / camera.width, height / camera.height
     params = list(camera.params)

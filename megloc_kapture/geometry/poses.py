@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 GeoPosition = tuple[float, float, float]
 """Latitude and longitude in degrees, height in metres above the ellipsoid."""
 
-# standard deviation of normally distributed values over their median magnitude: 1 / (3/4 quantile)
+# standard deviation of normal values divided by their median magnitude: 1 / (3/4 quantile)
 _DEVIATION_OF_MEDIAN = 1.482602218505602
 # WGS84 ellipsoid
 _SEMI_MAJOR_M = 6378137.0
@@ -162,7 +162,7 @@ def _squared_length(quats: Floats) -> Floats:
 
 
 def deviation_by_median(residuals: NDArray[np.floating[Any]]) -> np.float64:
-    """Estimate a standard deviation by the median magnitude (Rousseeuw and Croux, JASA 1993)."""
+    """Estimate a standard deviation from the median magnitude (Rousseeuw and Croux, JASA 1993)."""
     return _DEVIATION_OF_MEDIAN * np.median(np.abs(residuals))
 
 

@@ -1,7 +1,7 @@
 """Compiled projection of points with derivatives, and of depth maps, in COLMAP's camera models.
 
 The models follow COLMAP's ``sensor/models.h``, including its expansions near the axis. Import this
-module lazily: numba takes half a second.
+module lazily: numba takes half a second to load.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -296,7 +296,7 @@ def _draw(depth, px, z, max_jump, inverse, front):
             visible[r, c] = math.isfinite(px[r, c, 0] + px[r, c, 1])
     for r in range(rows - 1):
         for c in range(columns - 1):
-            # split along a diagonal with visible ends, preferably that with the smaller depth step
+            # split along a diagonal with visible ends, preferably the one of smaller depth step
             falling = abs(depth[r, c] - depth[r + 1, c + 1])
             rising = abs(depth[r, c + 1] - depth[r + 1, c])
             whole = visible[r, c] and visible[r + 1, c + 1]
