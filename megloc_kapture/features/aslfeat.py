@@ -59,7 +59,9 @@ _BLUR_PX = 0.8  # Gaussian sigma before each step, in pixels of the smaller imag
 class AslFeatOptions(LocalNetworkOptions):
     weights: str = Field(default="aslfeat", description="name in the registry, or a file")
     threshold: float = Field(default=0.5, ge=0, description="smallest score of a keypoint")
-    nms_radius: int = Field(default=1, ge=0, description="pixels")
+    nms_radius: int = Field(
+        default=1, ge=0, description="radius of non-maximum suppression, pixels"
+    )
     max_edge_ratio: float = Field(
         default=10.0,
         ge=1,

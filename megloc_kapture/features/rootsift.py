@@ -49,7 +49,7 @@ class RootSift:
         sift = cv2.SIFT.create(
             # OpenCV applies a mask after the selection, so no limit is passed with a mask.
             # Describing only the unmasked keypoints in a second call would change descriptors:
-            # if none of them is in the first octave, OpenCV builds another pyramid
+            # if none of them is in the first octave, OpenCV builds a different pyramid
             nfeatures=options.max_keypoints if mask is None else 0,
             contrastThreshold=options.contrast_threshold,
             # without it, the first octave is shifted by a quarter pixel

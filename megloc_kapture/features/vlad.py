@@ -31,8 +31,7 @@ _LEAST = 1e-9
 # whitening divides by standard deviations raised to this power, as AP-GeM does; with 1, as in Jegou
 # and Chum, all images of a small map are equally dissimilar
 WHITENING_POWER = 0.5
-# number of descriptors that train a vocabulary, the same share of each image's; number of Lloyd
-# steps
+# descriptors that train a vocabulary, the same share of each image's; steps of Lloyd's algorithm
 TRAINING_DESCRIPTORS, LLOYD_STEPS = 200_000, 20
 
 
@@ -41,8 +40,8 @@ class VladOptions(Options):
     dimensions: int | None = Field(
         default=None,
         gt=0,
-        description="dimensions after PCA whitening, reduced to fewer than the number of map "
-        "images; none: no whitening",
+        description="dimensions after PCA whitening, at most the number of map images minus 1; "
+        "none: no whitening",
     )
     seed: int = Field(default=0, ge=0)
     local_type: str | None = Field(
