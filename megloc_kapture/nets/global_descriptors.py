@@ -41,7 +41,7 @@ _OPENIBL_MEAN_RGB = (123.68, 116.779, 103.939)
 DESCRIPTOR_SIZE = 2048
 # components of AP-GeM are divided by powers of their variances, as in the authors' evaluation
 WHITENING_POWER = 0.25
-# optional whitening in a checkpoint, under scikit-learn's names
+# parts of an optional whitening in a checkpoint, under scikit-learn's names
 PCA_PARTS = ("mean", "components", "explained_variance", "whiten")
 
 
@@ -169,7 +169,7 @@ def _length(tensors: Mapping[str, torch.Tensor], key: str, default: int) -> int:
 class ApGemNet(ResNet):
     """AP-GeM's network from image to unit-norm vector.
 
-    ``mean`` and ``deviation`` are those of the training images, RGB in [0, 1].
+    ``mean`` and ``deviation`` describe the training images, RGB in [0, 1].
     ``normalised_features`` normalises pooled features before the last layer. ``whitening`` is set
     by :func:`apgem_from`.
     """
@@ -219,7 +219,7 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str, whitening: str =
     depth = RESNET_DEPTHS.get(len(blocks))
     if depth is None or "adpool.p" not in state:
         raise DataError(
-            "not AP-GeM: it needs adpool.p and layer3.* of ResNet-50 or ResNet-101", path=where
+            "not AP-GeM: the file lacks adpool.p or layer3.* of ResNet-50 or ResNet-101", path=where
         )
     net = ApGemNet(
         depth,

@@ -81,7 +81,7 @@ class Rendered:
     # (N,), NeRF-W's standard deviation of the colour; its minimum without a transient part
     beta: torch.Tensor
     weights: torch.Tensor  # (N, S), share of the light that each sample absorbs
-    transient_density: torch.Tensor  # (), mean over all samples; 0 without a transient part
+    transient_density: torch.Tensor  # scalar mean over all samples; 0 without a transient part
     coarse_rgb: torch.Tensor | None = None
 
 
@@ -129,7 +129,7 @@ def stratified(rays: Rays, count: int, generator: torch.Generator | None) -> tor
 def importance(
     t: torch.Tensor, weights: torch.Tensor, count: int, generator: torch.Generator | None
 ) -> torch.Tensor:
-    """Draw importance samples (N, count) by the weights (N, S) at t (N, S): NeRF, section 5.2."""
+    """Draw importance samples (N, count) from weights (N, S) at t (N, S): NeRF, section 5.2."""
     edges = 0.5 * (t[:, 1:] + t[:, :-1])
     inner = weights[:, 1:-1].detach() + 1e-5
     shares = torch.cumsum(inner / inner.sum(1, keepdim=True), dim=1)

@@ -138,7 +138,7 @@ def load_strictly(
         for what, keys in (
             ("missing keys", missing),
             ("unexpected keys", unexpected),
-            ("keys with another shape", reshaped),
+            ("keys with a different shape", reshaped),
         )
         if keys
     ]

@@ -243,7 +243,7 @@ def deform_conv2d(
 
     Parameters
     ----------
-    x : (B, C, H, W); fastest in channels-last memory, which the result has.
+    x : (B, C, H, W); fastest in channels-last memory. The result is channels-last.
     offset : (B, 18, H, W), pixels: (dy, dx) per tap, taps row by row.
     weight, bias : (D, C, 3, 3), and (D,) or None.
     mask : (B, 9, H, W) or None, amplitudes.

@@ -175,12 +175,12 @@ def log_optimal_transport(
 ) -> list[torch.Tensor]:
     """Compute log partial assignments by Sinkhorn's algorithm, dustbins last.
 
-    In the exponential, rows and columns sum to 1, the dustbin's row to M and its column to N.
+    After exponentiation, rows and columns sum to 1, the dustbin's row to M, its column to N.
 
     Parameters
     ----------
     scores : matrices (N, M) of any sizes, N and M at least 1, all float32 or all float64.
-    bin_score : (), the dustbin score.
+    bin_score : scalar, the dustbin score.
     iterations : at least 1; each normalises the rows, then the columns.
     """
     like = scores[0]
