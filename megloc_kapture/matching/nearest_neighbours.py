@@ -15,7 +15,7 @@ _BLOCK_ROWS = 512
 
 
 class NearestNeighbourOptions(Options):
-    """Options of nearest-neighbour matching; defaults: docs/experiments/matching.md."""
+    """Options for nearest-neighbour matching; measurements: docs/experiments/matching.md."""
 
     mutual: bool = True
     max_ratio: float | None = Field(

@@ -65,7 +65,7 @@ class SuperGlueOptions(NetworkOptions):
 
 
 class SuperGlue(PairNetwork[SuperGlueOptions]):
-    """Matcher plugin ``superglue``: keypoints need the detector's score as third column."""
+    """Matcher plugin ``superglue``: keypoints need the detector's score as the third column."""
 
     Options = SuperGlueOptions
 
@@ -104,7 +104,7 @@ def network_input(
     if not ((scores > 0) & (scores <= 1)).all():
         worst = scores[~((scores > 0) & (scores <= 1))][0]
         raise DataError(
-            "SuperGlue needs the detector's score as third column of the keypoints, above 0 "
+            "SuperGlue needs the detector's score as the third column of the keypoints, above 0 "
             f"and at most 1; a keypoint has {worst:g}"
         )
     if len(table) and descriptors.shape != (len(table), descriptor_size):

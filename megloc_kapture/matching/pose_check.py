@@ -53,7 +53,7 @@ def count_fitting(
 ) -> tuple[int, ...]:
     """Count the matched rays that fit the poses as given, and in each convention.
 
-    Rays and slopes: see :func:`verify_with_poses`; ``side_px``: larger side of the images.
+    For rays and slopes see :func:`verify_with_poses`; ``side_px`` is the images' larger side.
     """
     options = KnownPoseOptions(max_error_px=_MAX_ERROR_SHARE * side_px)
     counts = []
@@ -95,10 +95,10 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
 def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
     """Return the images with contradicting poses, and the number of images with an agreeing pair.
 
-    The weight of a pair is its number of matches. Pairs that only look alike have few, and are left
-    out below half of the usual number, the median over the images of their largest number. A wrong
-    pose also affects the pairs with images whose poses are correct, so the worst image is removed
-    first, repeatedly. A single pair is no evidence against an image.
+    Pairs are weighted by their numbers of matches. Images that only look alike have few matches, so
+    pairs with less than half of the usual number, the median over the images of an image's largest
+    number, are left out. A wrong pose also affects pairs with correctly posed images, so the worst
+    image is removed first, repeatedly. A single pair is no evidence against an image.
     """
     largest: dict[str, int] = {}
     for pair in pairs:

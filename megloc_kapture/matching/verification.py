@@ -32,10 +32,10 @@ Floats = NDArray[np.float64]
 _MAX_RAY_ERROR_PX = 0.1  # largest error of a pixel converted to a ray and back
 _MIN_AGREEING = 0.5  # smallest share of a variant's matches that agree with the model
 _SAMPLE = 5  # matches that determine a relative pose
-_THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best result counts
+_THRESHOLDS = (1.0, 0.5, 0.25)  # tested shares of the error threshold; the best is used
 # largest expected number of false alarms; strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
-# at most about this many mismatched pairs measure how often a wrong match agrees
+# how often a wrong match agrees is measured on at most about this many mismatched pairs
 _MAX_WRONG_PAIRS = 20_000
 # a pair with fewer verified matches counts as not overlapping
 MIN_MATCHES = 15
@@ -43,7 +43,7 @@ _MIN_ITERATIONS, _CONFIDENCE = 20, 0.999  # RANSAC of relative poses
 
 
 class KnownPoseOptions(Options):
-    """Options of verification with known poses."""
+    """Options for verification with known poses."""
 
     max_error_px: float = Field(
         default=4.0, gt=0, description="largest Sampson distance of a match"
@@ -51,7 +51,7 @@ class KnownPoseOptions(Options):
 
 
 class TwoViewOptions(Options):
-    """Options of two-view verification; cameras are calibrated, so planes are not degenerate."""
+    """Options for two-view verification; cameras are calibrated, so planes are not degenerate."""
 
     max_error_px: float = Field(
         default=4.0, gt=0, description="largest Sampson distance of an inlier"
@@ -261,7 +261,7 @@ def known_pose_of_variants(
 ) -> PairVerifier:
     """Return a verifier that uses a known pose.
 
-    ``other_rays`` (M, 3) and ``other_slopes`` (M, 2, 2) are those of the other image's keypoints.
+    ``other_rays`` (M, 3) and ``other_slopes`` (M, 2, 2) belong to the other image's keypoints.
     """
 
     def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -334,11 +334,11 @@ def agree_by_chance(
 ) -> bool:
     """Return True if wrong matches may agree with a relative pose as well as these matches do.
 
-    Keypoints (N, 2) are those of the verified matches among ``num_matches``. RANSAC finds a model
+    Keypoints (N, 2) belong to the verified matches, out of ``num_matches``. RANSAC finds a model
     even for wrong matches. The number of false alarms (Moisan and Stival, IJCV 2004) is the
     expected number of equally good models of wrong matches. Keypoints cluster on texture, so the
     probability that a wrong match is near its epipolar line is measured on mismatched pairs of the
-    keypoints; it is at least that of uniform positions.
+    keypoints; the probability for uniform positions is its lower bound.
     """
     from scipy.special import gammaln
     from scipy.stats import binom
