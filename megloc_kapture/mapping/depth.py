@@ -92,7 +92,7 @@ def lift_with_covariances(
     image_camera: Camera,
     depth_camera: Camera,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Lift keypoints with a depth map that has the image's centre; also return covariances.
+    """Lift keypoints with a depth map from the image's camera centre; also return covariances.
 
     ``sigma_m`` float32 (H, W) are the standard deviations of depth, 0 where unknown, for a keypoint
     noise of a third of a pixel, which pose estimation assumes for a map. Returns points (N, 3) in
@@ -150,7 +150,7 @@ def sample_depth(
 
 
 class DepthVerificationOptions(Options):
-    """Options of depth verification.
+    """Options for depth verification.
 
     The default noise is that of a structured-light sensor: 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et
     al., 3DIMPVT 2012, eq. 4). For a laser scan use about ``[0.003, 0, 0]``.
@@ -174,7 +174,7 @@ class DepthVerificationOptions(Options):
         # the parabola's minimum is at z = -b / 2c if that is positive, else at 0
         lowest = a - b * b / (4.0 * c) if c > 0 and b < 0 else a
         if not np.isfinite(noise).all() or lowest <= 0 or c < 0 or (c == 0 and b < 0):
-            raise ValueError("noise is not positive at every depth")
+            raise ValueError("noise must be positive at every depth")
         return noise
 
 

@@ -197,7 +197,7 @@ def camera_fault(camera: Camera) -> str | None:
     ratios = lengths[straight > 0.02] / straight[straight > 0.02]
     if len(ratios) and not (ratios.min() > 0.5 and ratios.max() < 3.0):
         farthest = max(ratios.tolist(), key=lambda ratio: abs(math.log(max(ratio, 1e-6))))
-        return f"its distortion shrinks image radii by a factor of {farthest:.2g}"
+        return f"its distortion divides image radii by {farthest:.2g}"
     return None
 
 

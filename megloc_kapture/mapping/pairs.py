@@ -37,7 +37,7 @@ def unique_pairs(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class PairsByPosesOptions(Options):
-    """Options of pairs by poses; they count neighbours, so the scale need not be metric."""
+    """Options for pairs by poses; they count neighbours, so the scale need not be metric."""
 
     num_neighbours: int = Field(
         default=20, gt=0, description="number of nearest camera centres per image"
@@ -69,7 +69,7 @@ def pairs_by_poses(
         sizes.append(min(largest, 2 * sizes[-1]))
     parts = []
     for image in range(count):
-        for size in sizes:  # if neighbours have other viewing directions, search more of them
+        for size in sizes:  # if neighbours look in different directions, search more of them
             near = tree.query(centers[image], k=size)[1]
             similar = axes[near] @ axes[image] >= min_cosine
             chosen = near[similar & (near != image)][:wanted]

@@ -203,5 +203,5 @@ def test_the_default_noise_is_the_published_formula() -> None:
 
 @pytest.mark.parametrize("noise", [(0.0, 0.0, 0.1), (0.001, -0.01, 0.001), (0.01, -0.1, 0.0)])
 def test_noise_that_is_not_positive_is_refused(noise: tuple[float, float, float]) -> None:
-    with pytest.raises(ValidationError, match="not positive at every depth"):
+    with pytest.raises(ValidationError, match="must be positive at every depth"):
         DepthVerificationOptions(noise=noise)
