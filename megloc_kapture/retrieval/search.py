@@ -15,7 +15,7 @@ from megloc_kapture.values import Options
 _BLOCK_ELEMENTS = 1 << 24  # similarities in memory, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # elements of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # largest number of rows in a block, even if vectors are short
-_GROUP = 8  # scores per group; the groups' maxima give a lower bound of the best scores
+_GROUP = 8  # scores per group; the groups' maxima give a lower bound on the best scores
 Float32 = NDArray[np.float32]
 Similarities = NDArray[np.floating[Any]]
 Matrices = Sequence[Similarities]
@@ -124,7 +124,7 @@ def _merge(best: Ranking, scores: Float32, first_query: int, first_row: int) -> 
 
 
 def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Return the ``count`` best scores (q, b) per row, and their columns; the first win ties."""
+    """Return the ``count`` best of each row of scores (q, b), and columns; ties go to the first."""
     height, width = scores.shape
     if width <= count:
         return scores, np.broadcast_to(np.arange(width), scores.shape)
@@ -149,7 +149,7 @@ _RANKED_IMAGES = 200  # smallest length of the ranking per feature in reciprocal
 
 
 class FusionOptions(Options):
-    """Options of the fusion of several global features' similarities or rankings."""
+    """Options for fusing the similarities or rankings of several global features."""
 
     method: FusionMethod = Field(
         default="ghm",
@@ -195,8 +195,8 @@ def fuse_rankings(
 ) -> Ranking:
     """Fuse ranked lists, int64 (Q, K_i) per feature, by their reciprocal ranks.
 
-    Returns indices int64 (Q, top_k), best first, and sums float32. Where the lists have fewer
-    images, the index is -1 and the sum -inf. Ties are in the order of the indices.
+    Returns indices int64 (Q, top_k), best first, and sums float32. If the lists have fewer than
+    ``top_k`` images, the rest is -1 and -inf. Ties are in the order of the indices.
     """
     shares = normalized_weights(weights, len(lists)).tolist()
     indices = np.full((len(lists[0]), top_k), -1, dtype=np.int64)
