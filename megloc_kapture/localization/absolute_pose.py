@@ -143,7 +143,7 @@ def _too_few_agree(num_inliers: int, count: int, options: AbsolutePoseOptions) -
 def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[Floats, Floats]:
     """Return the errors in pixels (N,) of all matches and their Mahalanobis distances (N,).
 
-    The covariance of an error is that of 1 px noise plus the projected covariance of the point.
+    The covariance of an error is that of a 1 px noise plus the point's projected covariance.
     Errors and distances are infinite behind the camera and for points that are not finite.
     """
     pose = undo_recentring(rig_from_world, -problem.offset)
@@ -222,7 +222,7 @@ def _whitening(
         s00 = 1.0 + _quadratic(problem.covariances, u, u)
         s01 = _quadratic(problem.covariances, u, v)
         left = 1.0 + _quadratic(problem.covariances, v, v) - s01**2 / s00
-    # unknown covariances count as zero
+    # unknown covariances are treated as zero
     known = (s00 > 0) & (s00 < np.inf) & (left > 0) & (left < np.inf)
     s00, s01, left = s00[known], s01[known], left[known]
     whitening[known] = np.stack([s00**-0.5, -s01 / s00 * left**-0.5, left**-0.5], axis=1)

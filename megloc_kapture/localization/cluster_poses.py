@@ -50,7 +50,7 @@ OfViews = Sequence[Sequence[Correspondences]]
 
 # images that share fewer points are not linked
 _MIN_SHARED_POINTS = 10
-# only this many clusters, those with the most matches, get a pose
+# a pose is estimated for at most this many clusters, those with the most matches
 MAX_CLUSTERS = 10
 
 
@@ -85,9 +85,9 @@ def cluster_by_centers(centers: NDArray[np.float64], radius: float) -> NDArray[n
 def cluster_by_shared_points(
     shared: NDArray[np.int64], min_shared_points: int
 ) -> NDArray[np.int64]:
-    """Cluster images by shared points (N, N); labels (N,) in order of first members.
+    """Cluster images by numbers of shared points (N, N); labels (N,) in order of first members.
 
-    If no two images share a point, as when all points come from depth, all are one cluster.
+    If no two images share a point, as when all points come from depth, all form one cluster.
     """
     apart = shared - np.diag(np.diag(shared))
     if not apart.any():

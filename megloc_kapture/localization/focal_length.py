@@ -41,7 +41,7 @@ from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, LocalizationResult, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
-# _CORRELATED: map errors of neighbouring points are correlated, so standard deviations that assume
+# _CORRELATED: errors of neighbouring map points are correlated, so standard deviations that assume
 # independent matches are too small by this factor; _MIN_ERROR_PX: smallest assumed standard
 # deviation of a match
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
@@ -70,7 +70,7 @@ _INDEPENDENT = 30
 # share of their difference
 _BIASED_BY = 0.1
 # a photograph whose focal length differs from the shared one by more standard deviations was taken
-# with another zoom
+# with a different zoom
 _MAX_SIGMAS = 3.0
 # factor on the standard deviation of the shared focal length, because errors of the map and of the
 # lens model are correlated between photographs
@@ -204,7 +204,7 @@ def _freed(
 
 
 def misfits_text(results: Iterable[LocalizationResult], where: str) -> str | None:
-    """Summarize how many queries have a misfitting focal length."""
+    """Summarize how many queries have a given focal length that does not fit."""
     count = sum(any(_DOES_NOT_FIT in remark for remark in result.remarks) for result in results)
     if not count:
         return None
@@ -283,7 +283,7 @@ def _is_possible(problem: PoseProblem, estimate: PoseEstimate, given: Camera) ->
 def refine_with_intrinsics(
     problem: PoseProblem, estimate: PoseEstimate, options: AbsolutePoseOptions, given: Camera
 ) -> tuple[PoseProblem, Pose | Failure]:
-    """Refine pose and intrinsics of an uncertain camera in alternation.
+    """Refine pose and intrinsics of an uncertain camera alternately.
 
     ``given`` is the camera with its prior deviation. The returned problem and Pose have the refined
     intrinsics; the posterior ``focal_deviation`` is in the Pose's camera only.
@@ -466,8 +466,8 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
     """Re-solve poses of photographs of one camera with a shared estimate of its intrinsics.
 
-    A pose is kept as it is if its focal length contradicts the shared one (another zoom) or if it
-    was refined by another method.
+    A pose is kept as it is if its focal length contradicts the shared one (a different zoom) or if
+    it was refined by another method.
     """
     usable = [p.camera for p in poses if p.camera is not None and p.camera.focal_deviation > 0]
     if len(usable) < 2:

@@ -119,7 +119,7 @@ class Correspondences:
     ----------
     keypoint_ids, point_ids : int64 (N,), rows of the query's keypoints, ascending, and of the map
         points.
-    support : int64 (N,), number of map images that give the match.
+    support : int64 (N,), number of map images that contribute the match.
     image_rows : int64 (sum of support,), these images as indices into ``TypedMatches.matches``,
         grouped by match.
     """

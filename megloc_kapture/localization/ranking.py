@@ -62,8 +62,8 @@ class DistinctiveInliers:
 
     Similar rooms all explain the query's walls and furniture. An inlier has the weight ``1 / n **
     4``, with ``n`` the number of hypotheses that have an inlier within a radius (after the
-    geometric bursts of Sattler et al., CVPR 2016). One that explains another's inliers does not
-    compete.
+    geometric bursts of Sattler et al., CVPR 2016). Two hypotheses do not compete if one explains
+    the other's inliers.
     """
 
     def score(self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene) -> Floats:
@@ -109,7 +109,7 @@ class PerceptualOptions(NetworkOptions):
 
 
 class PerceptualRanker:
-    """Plugin ``perceptual``: smallest image distance of the query to the view warped to its pose.
+    """Plugin ``perceptual``: image distance between the query and the map warped to its pose.
 
     Only clusters with enough inliers take part. The clusters with the smallest distances, the
     finalists, are compared pairwise over the pixels valid in both, since distances over different
@@ -190,7 +190,7 @@ class PerceptualRanker:
         distances: Floats,
         at: NDArray[np.int64],
     ) -> Floats:
-        """Return by how much each distance is smaller than the others', on average."""
+        """Return how much smaller each distance is than the others', on average."""
         margins = np.zeros(len(finalists))
         for i, first in enumerate(finalists):
             for j, second in enumerate(finalists[:i]):
@@ -203,7 +203,7 @@ class PerceptualRanker:
         return margins / max(len(finalists) - 1, 1)
 
     def _mean_distance(self, views: Sequence[_Compared], valid: Sequence[Mask]) -> float:
-        """Average over a rig's views, weighted by valid pixels; infinite for too few of them."""
+        """Average over a rig's views, weighted by valid pixels; infinite if these are too few."""
         counts = np.array([int(each.sum()) for each in valid])
         if counts.sum() < max(1.0, _MIN_VALID * sum(each.size for each in valid)):
             return float("inf")

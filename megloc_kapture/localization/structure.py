@@ -24,8 +24,8 @@ _MIN_FILLED = 0.5  # smallest valid share of a window
 _HALF_PATCH_PX, _SEARCH_PX = 12, 6
 # limits that bound the time: points per view, and map images from which patches are taken
 _MAX_POINTS, _MAX_IMAGES = 300, 4
-# a patch with a smaller standard deviation has no texture; with a smaller correlation, it counts as
-# not found
+# a patch with a smaller standard deviation has no texture; if the best correlation is smaller, the
+# patch is not found
 _MIN_DEVIATION, _MIN_CORRELATION = 5.0, 0.6
 # largest ratio of scales of query and map image; patches are treated as fronto-parallel planes
 _MAX_SCALE = 2.0
@@ -190,7 +190,7 @@ def _displacements_in(
 
 
 def _peak(values: NDArray[Any], at: int) -> float:
-    """Return the position of a maximum between samples, by a parabola."""
+    """Return the position of a maximum between samples, by fitting a parabola."""
     if not 0 < at < len(values) - 1:
         return float(at)
     before, here, after = (float(value) for value in values[at - 1 : at + 2])
