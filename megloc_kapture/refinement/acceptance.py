@@ -35,7 +35,7 @@ _MIN_SIGNIFICANCE = 2.5
 MIN_CORRELATION = 0.12
 # share of the overlap at the old pose that the new pose may lose
 _MAX_OVERLAP_LOSS = 0.1
-# the curvature of the objective must be at least this share of that of the normal equations
+# smallest curvature of the objective, as a share of the normal equations' curvature
 _LEAST_SHARE = 0.02
 # displacement of points on either side of a finite difference, in pixels of the level
 _CURVATURE_PX = 0.5
@@ -49,7 +49,7 @@ class RenderingOptions(Options):
     appearance: Appearance = Field(
         default="normalised",
         description="normalised: compare brightness with locally normalised mean and contrast, "
-        "also between day and night; colours: compare red, green and blue, normalised likewise",
+        "even between day and night; colours: compare red, green and blue, normalised likewise",
     )
     max_references: int = Field(
         default=4, gt=0, description="largest number of reference images with depth"
@@ -139,9 +139,11 @@ def _moved_px(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -
 
 def _too_far(moved_m: float, turned_deg: float, options: RenderingOptions) -> str:
     if moved_m > options.max_translation_m:
-        return f"would move {moved_m:.2f} m, more than {options.max_translation_m:g} m"
+        return f"the pose would move {moved_m:.2f} m, more than {options.max_translation_m:g} m"
     if turned_deg > options.max_rotation_deg:
-        return f"would turn {turned_deg:.2f} deg, more than {options.max_rotation_deg:g} deg"
+        return (
+            f"the pose would turn {turned_deg:.2f} deg, more than {options.max_rotation_deg:g} deg"
+        )
     return ""
 
 
@@ -202,7 +204,7 @@ def _losses(rows: Float64, squared_scale: float) -> Float64:
 
 
 def correlation(problem: LevelProblem, rows: Float64) -> float:
-    """Return the correlation of query and reference values by ``rows`` of the problem."""
+    """Return the correlation of query and reference values, from ``rows`` of the problem."""
     chosen, seen = problem.chosen, ~np.isnan(rows[:, 0, 0])
     query, reference, groups = rows[seen][..., 7], chosen.values[seen], chosen.groups[seen]
     product, query_square, reference_square = 0.0, 0.0, 0.0

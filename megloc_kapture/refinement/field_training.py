@@ -100,11 +100,11 @@ class FieldTrainer:
         self._step, self._seconds = 0, 0.0
 
     def resume(self, state: bytes, path: Path) -> None:
-        """Restore a state passed to ``keep``; DataError if damaged or from another training."""
+        """Restore a state passed to ``keep``; DataError if damaged or from another run."""
         content = load_state(state, path, self._field.module, self._optimizer)
         if content.get("training") != self._fingerprint:
             raise DataError(
-                "belongs to a training with other options or images; -f starts over", path=path
+                "is from a training run with different options or images; -f starts over", path=path
             )
         self._step, self._seconds = content["step"], float(content["seconds"])
 

@@ -64,7 +64,7 @@ _SAME_VIEW_M, _SAME_VIEW_DEG = 0.2, 10.0
 
 
 class IcpOptions(Options):
-    """Options of the refinement by ICP.
+    """Options for refinement by ICP.
 
     The last of ``max_distances_m`` is about three standard deviations of a structured-light
     sensor's depth at the end of its range, 4 m. The deviation is 0.0012 + 0.0019 (z - 0.4)^2 m
@@ -106,7 +106,7 @@ class IcpOptions(Options):
         if len(self.voxels_m) != len(self.max_distances_m):
             raise ValueError("voxels_m and max_distances_m must have the same number of levels")
         if (depth_noise(np.linspace(0.0, self.depth.max_depth_m, 256), self.noise) <= 0).any():
-            raise ValueError(f"noise is not positive at every depth: {self.noise}")
+            raise ValueError(f"noise must be positive at every depth: {self.noise}")
         return self
 
 
@@ -191,7 +191,7 @@ def _reason_to_skip(
     if reach < _MIN_OVERLAP:
         return (
             f"{100 * reach:.0f} % of the query's points are within {options.max_distances_m[0]:g} "
-            f"m of the map, at least {100 * _MIN_OVERLAP:g} % must be"
+            f"m of the map, but at least {100 * _MIN_OVERLAP:g} % must be"
         )
     return ""
 
@@ -240,7 +240,7 @@ def _reason_to_refuse(
     if after.overlap < _MIN_OVERLAP:
         return (
             f"{100 * after.overlap:.0f} % of the query's points are on the map, "
-            f"at least {100 * _MIN_OVERLAP:g} % must be"
+            f"but at least {100 * _MIN_OVERLAP:g} % must be"
         )
     if condition > _MAX_CONDITION:
         return (

@@ -1,7 +1,7 @@
 """Radiance field of a map, which renders colour and depth from any pose.
 
 It is trained by :mod:`~megloc_kapture.refinement.field_training`. As in NeRF-W's evaluation, the
-appearance of a held-out image is fitted to its left half, and the error is that of its right half.
+appearance of a held-out image is fitted to its left half, and the error measured on its right half.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class NeuralField:
         self.light_rows = torch.tensor(light_rows, device=self.device)
 
     def rays(self, camera: Camera, cam_from_world: RigidTransform) -> Rays:
-        """Return rays (H * W,) through the pixel centres of a view, by rows."""
+        """Return rays (H * W,) through the pixel centres of a view, row by row."""
         directions = pixel_rays(camera) @ cam_from_world.rotation_matrix()
         return self.rays_from(cam_from_world.center(), directions)
 
@@ -95,7 +95,7 @@ class NeuralField:
     def appearance_of(self, image: str) -> torch.Tensor:
         """Return the appearance embedding (A,) of a training image."""
         if image not in self.images:
-            raise DataError(f"the field was not trained on an image {image!r}")
+            raise DataError(f"the field was not trained on image {image!r}")
         row = self.light_rows[self.images.index(image)]
         return self.module.appearance.weight[row].detach()
 

@@ -57,7 +57,7 @@ class Alignment:
     def moved(
         self, cam_from_world: RigidTransform, gain_step: Float64, bias_step: Float64
     ) -> Alignment:
-        """Return an alignment with another pose and steps (G, C) added; gains stay positive."""
+        """Return an alignment with a new pose, and steps (G, C) added; gains stay positive."""
         gains = np.maximum(self.gains + gain_step, _MIN_GAIN)
         return Alignment(cam_from_world, gains, self.biases + bias_step, self.deviation)
 

@@ -111,7 +111,7 @@ def read_values(values, valid, x, y, out, readable):
 def evaluate(chosen, query, alignment, out):
     """Evaluate residuals and derivatives per point: ``out`` float64 (N, C, 8).
 
-    ``out``: the residual (NaN where invisible, the rest is then unset), six derivatives by a left
+    ``out``: the residual (NaN where invisible, the rest is then unset), six derivatives for a left
     perturbation of the pose (rotation first), and the query's value. ``chosen``: points (N, 3),
     values (N, C) and reference index (N,). ``query``: a level (h, w, C), its valid pixels, its
     scale (2,) and its :func:`camera_of`. ``alignment``: rotation and translation of
@@ -159,8 +159,8 @@ def normal_equations(rows, groups, squared_scale, sums):
     A point's ``e^2`` is the mean of its squared residuals over channels, and its cost is Geman and
     McClure's ``s^2 / 2  e^2 / (s^2 + e^2)``; an infinite s^2 gives least squares. The results are
     added to ``sums``: the matrix of the pose (6, 6), upper half; pose with gain and bias (G, C, 6,
-    2); entries (gain, gain), (gain, bias) and (bias, bias) (G, C, 3); gradients by the pose (6,)
-    and by gain and bias (G, C, 2).
+    2); entries (gain, gain), (gain, bias) and (bias, bias) (G, C, 3); gradients of the pose (6,)
+    and of gain and bias (G, C, 2).
     """
     pose, mixed, blocks, pose_gradient, own_gradient = sums
     channels = rows.shape[1]

@@ -30,7 +30,7 @@ _MAX_ANGLE_DEG = 60.0  # between the viewing directions of a query and of its re
 MAX_TRIED = 96  # largest number of images that are held out
 # smallest ratio of baseline to surface distance: an angle of about 6 deg between views
 _MIN_PARALLAX = 0.1
-# candidate references: an upper bound of the overlap is computed for the nearest images, and the
+# candidate references: an upper bound on the overlap is computed for the nearest images, and the
 # overlap itself for those with the largest bounds
 _NEAREST, _BEST = 200, 6
 _ASKED_POINTS = 300
@@ -68,7 +68,7 @@ class ReferenceImages:
     ) -> list[str]:
         """Return images with a similar viewing direction, nearest first.
 
-        They are from ``among``, the images with matches; without any, all images are candidates.
+        Candidates are the images ``among``, which have matches, or all images if there are none.
         """
         forward = cam_from_world.rotation_matrix()[2]
         facing = self._directions @ forward >= np.cos(np.deg2rad(_MAX_ANGLE_DEG))

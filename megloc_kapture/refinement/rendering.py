@@ -159,14 +159,14 @@ class RenderingRefinement:
 
     def _decide(self, old_overlap: float, candidate: Candidate | None) -> PoseRefinement:
         if candidate is None:
-            reason = f"fewer than {MIN_POINTS} points to compare"
+            reason = f"fewer than {MIN_POINTS} points can be compared"
             return PoseRefinement(self.start, reason, {"overlap_before": old_overlap})
         _, overlap = self._visibility(candidate.alignment.cam_from_world)
         return accept_or_keep(self.start, candidate, (old_overlap, overlap), self.options)
 
 
 def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
-    reason = f"references with depth cover {overlap:.0%} of the query"
+    reason = f"the references with depth only cover {overlap:.0%} of the query"
     return PoseRefinement(start, reason, {"overlap_before": overlap})
 
 
@@ -185,9 +185,9 @@ class Rendering:
     ) -> dict[str, float] | None:
         """Return measures of how far refinement moves a map image, see ``DISPLACEMENT``.
 
-        If the refined pose is rejected, they are those of the nearest minimum. None if overlap or
-        correlation is too small, other images do not determine the pose, or the minimum is out of
-        bounds.
+        If the refined pose is rejected, they are measured at the minimum nearest to the map's pose.
+        None if overlap or correlation is too small, other images do not determine the pose, or the
+        pose moves too far.
         """
         view = image_with_depth(image, scene)
         if view is None:

@@ -94,7 +94,7 @@ def test_an_interrupted_training_is_resumed(
         assert megloc(*command).status == 130
     assert [path.name for path in out.iterdir() if path.name[0] != "."] == ["field.state.pt"]
     megloc("render", out, "--along", mapping, "-o", tmp_path / "x").refused("train-field writes")
-    megloc(*command, "--seed", "1").refused("with other options or images; -f starts over")
+    megloc(*command, "--seed", "1").refused("with different options or images; -f starts over")
     assert megloc(*command).status == 0
     for name in ("field.json", "field.safetensors"):
         assert (out / name).read_bytes() == (field / name).read_bytes()
