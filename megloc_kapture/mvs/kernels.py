@@ -1,7 +1,7 @@
 """Compiled loops of stereo: plane-sweep costs, semi-global paths, consistency between views.
 
-Import only when needed: numba takes half a second. Brightness images are float32 (H, W), NaN where
-invalid; inverse depth is float32 (H, W), 0 where unknown.
+Import only when needed: numba takes half a second to load. Brightness images are float32 (H, W),
+NaN where invalid; inverse depth is float32 (H, W), 0 where unknown.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -128,7 +128,7 @@ def add_path(cost, grey, p1, p2, edge, dy, dx, total):
 
 @compiled_loop
 def best_labels(total, labels):
-    """Fill ``labels`` (H, W) with those of the smallest totals, refined by fitting a parabola."""
+    """Fill ``labels`` (H, W) with the labels of least total, refined by fitting a parabola."""
     height, width, depth = total.shape
     for y in range(height):
         for x in range(width):

@@ -31,8 +31,8 @@ _MIN_REGION_PX = 40  # in smaller islands, views agree by chance
 # number of other views that must confirm a pixel; with 2, a tenth of the pixels are lost, and the
 # share of depths with an error below 2 cm rises by only one percent
 _MIN_VIEWS = 1
-# views agree if a pixel projected to another view and back returns within this distance, and the
-# depths differ by at most this share per pixel of this tolerance (docs/experiments/mvs.md)
+# views agree if a pixel projected to another view and back returns within the first value, and the
+# relative difference of depth is at most the second times the first (docs/experiments/mvs.md)
 TOLERANCE_PX, _RELATIVE_PER_PX = 1.0, 0.01
 # largest relative standard deviation of depth; surfaces without texture exceed it
 _MAX_RELATIVE_SIGMA = 0.03
@@ -61,8 +61,8 @@ def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floa
 def pixel_step(projections: Projections, camera: Camera, limits: Floats) -> float:
     """Return the inverse depth step of about one pixel in the most sensitive source.
 
-    The pixels per step are averaged between the ``limits`` of inverse depth; the median over the
-    image counts.
+    The pixels per step are averaged between the ``limits`` of inverse depth; the result is for the
+    median over the image.
     """
     x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * n for n in (camera.width, camera.height)))
     pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
@@ -161,7 +161,7 @@ def agreeing_views(
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
     tolerance_px: float = TOLERANCE_PX,
 ) -> NDArray[np.uint8]:
-    """Count the other views (H, W) whose depth agrees when projected there and back."""
+    """Count, per pixel (H, W), the other views whose depth agrees when projected there and back."""
     from megloc_kapture.mvs.kernels import count_agreeing
 
     counts = np.zeros(depth_m.shape, np.uint8)
