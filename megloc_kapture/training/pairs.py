@@ -1,4 +1,4 @@
-"""Training pairs: images of a kapture with depth and poses, or views of single photographs.
+"""Training pairs: images of kapture data with depth and poses, or views of one photograph.
 
 Sources draw pairs with a given random generator and keep no state, so that a step's pairs depend on
 seed and step only. Views of a photograph have random homographies and lighting (DeTone et al., CVPR
@@ -130,7 +130,7 @@ class PosedPairs:
         try:
             rows = [(row_of[pair.query], row_of[pair.map]) for pair in pairs]
         except KeyError as error:
-            message = f"image {error} has no pose and depth in {self.folder}; -f starts over"
+            message = f"image {error} lacks a pose or depth in {self.folder}; -f starts over"
             raise DataError(message, path=path) from error
         near = np.array(rows, np.int64).reshape(-1, 2)
         return near, np.array([pair.score for pair in pairs], np.float64)

@@ -60,7 +60,7 @@ _MAX_GRADIENT = 1.0  # norm
 
 
 class TrainingOptions(NetworkOptions):
-    """Options of training SuperGlue on a frozen extractor's features."""
+    """Options for training SuperGlue on a frozen extractor's features."""
 
     half_precision: bool = Field(
         default=False, description="bfloat16, except for keypoint positions, transport and loss"
@@ -86,7 +86,7 @@ class TrainingOptions(NetworkOptions):
     )
     matcher_weights: str | None = Field(
         default=None,
-        description="initial SuperGlue; none: a new network, at first a nearest-neighbour matcher",
+        description="initial SuperGlue; none: a new one that starts as a nearest-neighbour matcher",
     )
     check_every: int = Field(
         default=1000, gt=0, description="steps between evaluations and checkpoints"
@@ -98,7 +98,7 @@ class TrainingOptions(NetworkOptions):
 
 
 class DescriptorOptions(TrainingOptions):
-    """Options of training a descriptor network with a frozen detector."""
+    """Options for training a descriptor network with a frozen detector."""
 
     through: Literal["superglue", "products"] = Field(
         default="superglue",
@@ -337,11 +337,11 @@ def _check_same_training(output: Path, record: Mapping[str, Any]) -> None:
     except (DataError, ValueError, AttributeError):
         known = None
     if known is None:
-        raise OutputError(f"{output}: not the output of a training; -f replaces it")
+        raise OutputError(f"{output}: not the output of a training run; -f replaces it")
     if known != record:
         changed = sorted(k for k in {*known, *record} if known.get(k) != record.get(k))
         raise OutputError(
-            f"{manifest}: is from another training ({', '.join(changed)}); -f starts over"
+            f"{manifest}: is from another training run ({', '.join(changed)}); -f starts over"
         )
 
 

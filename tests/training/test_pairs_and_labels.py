@@ -64,7 +64,7 @@ def test_measured_overlaps_are_read_again(walk: Path, other_walk: Path, tmp_path
     write_pairs(path, [replace(p, score=0.99) for p in pairs[1:]] + [replace(pairs[0], score=0.2)])
     again = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
     assert again.counts()["pairs"] == 1 < source.counts()["pairs"]
-    with pytest.raises(DataError, match=r"0\.txt: image '0\.png' has no pose and depth in .*; -f"):
+    with pytest.raises(DataError, match=r"0\.txt: image '0\.png' lacks a pose or depth in .*; -f"):
         PosedPairs(KaptureFolder(other_walk), SMALL, measured=path)
 
 

@@ -217,7 +217,7 @@ def test_invalid_training_is_refused(
         train(options(files, learning_rate=1e30), output, **data)
     assert not output.exists()
     train(chosen, output, **data)
-    with pytest.raises(OutputError, match=r"x\.json: is from another training \(options\); -f"):
+    with pytest.raises(OutputError, match=r"x\.json: is from another training run \(options\); -f"):
         train(options(files, steps=2), output, **data)
     output.with_suffix(".state.pt").write_bytes(b"PK damaged")
     with pytest.raises(DataError, match=r"x\.state\.pt: is damaged or from another training run"):
