@@ -100,7 +100,7 @@ def test_unusable_features_are_named(superglue_weights: Path) -> None:
     for value in (0.0, 1.5, -0.2, np.nan):
         table = good.keypoints_px.copy()
         table[4, 2] = value
-        with pytest.raises(DataError, match=f"score as third column.*has {value:g}"):
+        with pytest.raises(DataError, match=f"score as the third column.*has {value:g}"):
             network.match(ImageFeatures(table, good.descriptors, 640, 480), good)
     short = ImageFeatures(good.keypoints_px, good.descriptors[:, :32], 640, 480)
     with pytest.raises(DataError, match=r"small\.pth.*64 dimensions.*\(9, 32\)"):

@@ -35,7 +35,10 @@ def test_checkpoints_load_strictly() -> None:
     for tensors, message in (
         ({"bias": whole["bias"]}, "1 missing keys: weight"),
         (whole | {"extra": torch.ones(1)}, "1 unexpected keys: extra"),
-        (whole | {"bias": torch.ones(3)}, r"1 keys with another shape: bias is \(3,\), not \(2,\)"),
+        (
+            whole | {"bias": torch.ones(3)},
+            r"1 keys with a different shape: bias is \(3,\), not \(2,\)",
+        ),
     ):
         with pytest.raises(DataError, match=rf"^w\.pth: .*does not fit Linear; {message}$"):
             load_strictly(net, tensors, "w.pth")
