@@ -34,7 +34,10 @@ RENDERED_DATASETS = "megloc_kapture.rendered_datasets"
 
 
 class PluginChoice(Options):
-    """The registered name of a plugin and its options; a plain string sets the name alone."""
+    """The registered name of a plugin and its options; a plain string sets the name alone.
+
+    A list of one plugin is accepted: ``key=NAME`` and then ``key.options.x=1`` are merged to one.
+    """
 
     name: str
     options: dict[str, Any] = Field(default_factory=dict)
@@ -42,6 +45,8 @@ class PluginChoice(Options):
     @model_validator(mode="before")
     @classmethod
     def _named(cls, value: Any) -> Any:
+        if isinstance(value, list | tuple) and len(value) == 1:
+            value = value[0]
         return {"name": value} if isinstance(value, str) else value
 
 

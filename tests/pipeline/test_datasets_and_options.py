@@ -237,6 +237,8 @@ def test_assignments_and_tables_are_equivalent_and_the_last_counts() -> None:
     options = options_of_preset(changes=[changes])
     assert options == options_of_preset(assignments=assignments)
     assert options.matching.options == {"max_ratio": 0.9} and options.matching.name == "nn"
+    named = ["matching=nn", *assignments, "localization.rank=inliers", "localization.rank.name=x"]
+    assert options_of_preset("megloc", assignments=named).matching == options.matching
     tables = [{"query_pairs": {"top_k": 4}}, {"query_pairs": {"top_k": 5}}]
     assert options_of_preset(changes=tables).query_pairs.top_k == 5
     typed = ["query_pairs.top_k=6", "query_pairs.top_k=7"]
