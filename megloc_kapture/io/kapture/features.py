@@ -332,7 +332,12 @@ class FeatureWriter:
 
     def write(self, image: str, array: ArrayLike) -> None:
         """Write an image's array, (N, dsize) or (dsize,)."""
-        content = np.ascontiguousarray(array, dtype=self.config.dtype)
+        given, dtype = np.asarray(array), self.config.dtype
+        require(
+            given.size == 0 or np.can_cast(given.dtype, dtype, "same_kind"),
+            f"image {image}: {given.dtype}, but {dtype} in the {self.kind} of other images",
+        )
+        content = np.ascontiguousarray(given, dtype=dtype)
         require(
             content.size == 0 or content.shape[-1] == self.config.dsize,
             f"image {image}: {content.shape[-1]} columns, but {self.config.dsize} in the "

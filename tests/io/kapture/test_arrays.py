@@ -99,6 +99,12 @@ def test_a_writer_continues_a_folder_of_the_same_configuration_only(tmp_path: Pa
     with pytest.raises(DataError, match="image b: 6 columns, but 3 in the keypoints of other"):
         writer.write("b", np.zeros((1, 6)))
     assert "b" not in writer
+    config = FeatureConfig("n", np.dtype("uint8"), 3, "T")
+    descriptors = FeatureWriter(tmp_path, "descriptors", "T", config)
+    descriptors.write("empty", np.zeros((0, 3)))
+    # the values would be cut off to whole numbers
+    with pytest.raises(DataError, match="image b: float32, but uint8 in the descriptors of other"):
+        descriptors.write("b", np.full((1, 3), 0.5, np.float32))
 
 
 def test_members_of_a_tar_of_the_current_folder_are_read_by_name(tmp_path: Path) -> None:
