@@ -20,6 +20,7 @@ from megloc_kapture.cli.common import (
 )
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
+from megloc_kapture.errors import check_option
 from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
@@ -52,9 +53,11 @@ class Import(Common):
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """aachen, robotcar, 4seasons, inloc; kapture: any pair of kapture folders; colmap: a model;
     megadepth: training data, a folder DIR/SCENE per scene."""
-    root: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROOT")]
+    folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="ROOT")] = None
     """Folder of the dataset in its published layout; for colmap the model (sparse/0), or the
     workspace that contains it."""
+    root: Path | None = None
+    """The same as ROOT, as in megloc eval."""
     output: Output
     """Output folder."""
     images: Path | None = None
@@ -77,23 +80,25 @@ class Import(Common):
 
     def run(self) -> None:
         name = self.dataset.removeprefix(TWIN_PREFIX)
+        given = [path for path in (self.folder, self.root) if path is not None]
+        check_option(len(given) == 1, "give one folder: megloc import DATASET ROOT -o OUTPUT")
+        [root] = given
         if name == COLMAP:
-            self._import_colmap()
+            self._import_colmap(root)
             return
         if name == MEGADEPTH:
-            self._import_megadepth()
+            self._import_megadepth(root)
             return
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
-            self.root,
+            root,
             import_options=parse_assignments(self.set),
             query_prefix=self.query_prefix,
             allow_missing=self.allow_missing,
         )
         choice.check()
-        inputs = (self.root,)
-        with staged_output(self.output, kind=DATASET, force=self.force, inputs=inputs) as out:
-            counts = choice.import_to(self.root, out)
+        with staged_output(self.output, kind=DATASET, force=self.force, inputs=[root]) as out:
+            counts = choice.import_to(root, out)
             work = Work(track=self.track)
             unreadable = set_aside_unreadable(out / QUERY, out / SIDE_TABLES, work)
         print_counts(counts)
@@ -102,10 +107,10 @@ class Import(Common):
         if (summary := self.output / SUMMARY_FILE).is_file():
             print(summary.read_text(encoding="utf-8").rstrip())
 
-    def _import_colmap(self) -> None:
-        source = find_colmap(self.root, images=self.images, database=self.database)
+    def _import_colmap(self, root: Path) -> None:
+        source = find_colmap(root, images=self.images, database=self.database)
         with (
-            staged_output(self.output, kind=MAP, force=self.force, inputs=[self.root]) as out,
+            staged_output(self.output, kind=MAP, force=self.force, inputs=[root]) as out,
             open_executor("processes") as executor,
         ):
             work = Work(executor, self.track, force=self.force)
@@ -116,11 +121,11 @@ class Import(Common):
         if self.unit == NO_METRES:
             self.say("unit: unknown scale; use --unit m if the map is in metres")
 
-    def _import_megadepth(self) -> None:
+    def _import_megadepth(self, root: Path) -> None:
         options = options_with(MegaDepthOptions, self.set)
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
             work = Work(track=self.track)
-            counts = import_megadepth(self.root, out, options.scenes, work=work)
+            counts = import_megadepth(root, out, options.scenes, work=work)
         print_counts(counts)
 
 

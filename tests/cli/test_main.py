@@ -30,6 +30,7 @@ WRONG_ARGUMENTS = {
     "unknown command": (["localise"], "unknown command 'localise'; did you mean 'localize'"),
     "missing flags": (["refine-poses", "-i", "map", "--poses", "p", "-o", "out"], "--query PATH"),
     "unknown flag": (["eval", "kapture", "--roots", "x"], "Perhaps you meant: --root "),
+    "import without a root": (["import", "aachen", "-o", "x"], "megloc import DATASET ROOT"),
     "not a number": (["eval", "--workers", "two"], "Error parsing --workers: "),
     "not a choice": (["eval", "-v", "loud"], "invalid choice 'loud'"),
     "camera of a kapture folder": (
@@ -204,7 +205,8 @@ def test_a_damaged_dataset_is_refused(
     damage(dataset)
     before = folder_bytes(dataset)
     new = dataset.parent / "new"
-    megloc("import", "kapture", dataset, "-o", new / "imported").refused(message)
+    for root in (dataset,), ("--root", dataset):  # as in megloc eval
+        megloc("import", "kapture", *root, "-o", new / "imported").refused(message)
     assert not any(new.glob("*"))
     assert folder_bytes(dataset) == before
 
