@@ -104,8 +104,8 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     poses: dict[str, RigidTransform | None] = {}
     for number, fields in rows:
         with named(path, number):
-            # the second column of MLAD's rows is a timestamp
-            further = 8 < len(fields) <= 11 and not fields[1].isdecimal()
+            # MLAD's rows begin with two timestamps
+            further = 8 < len(fields) <= 11 and not "".join(fields[:2]).isdecimal()
             require(
                 len(fields) == 8 or further,
                 f"{len(fields)} columns instead of 8 ({COLUMNS}); convert other formats "

@@ -82,7 +82,7 @@ def test_invalid_poses_are_not_written(pose: RigidTransform, words: str) -> None
         '"a.jpg","1","0","0","0","1.5","-0.2","3"\n',
         "image,qw,qx,qy,qz,tx,ty,tz,center_x\na.jpg,1,0,0,0,1.5,-0.2,3,-1.5\n",
         "image tx ty tz qx qy qz qw\na.jpg 1.5 -0.2 3 0 0 0 1\n",
-        "a.jpg 1.0 0 0 0 1.5 -0.2 3 525.0\n",
+        "a.jpg 1 0 0 0 1.5 -0.2 3 525.0\n",
         "a.jpg 1.0 0 0 0 1.5 -0.2 3 0.12 0.013 345\n",
         ",name,qw,qx,qy,qz,tx,ty,tz\n0,a.jpg,1,0,0,0,1.5,-0.2,3\n",
         "Image,Q_W,Q_X,Q_Y,Q_Z,T_X,T_Y,T_Z\na.jpg,1,0,0,0,1.5,-0.2,3\nb.jpg,,,,,,,\n",
