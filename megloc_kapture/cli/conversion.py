@@ -53,7 +53,10 @@ class Import(Common):
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """aachen, robotcar, 4seasons, inloc; kapture: any pair of kapture folders; colmap: a model;
     megadepth: training data, a folder DIR/SCENE per scene."""
-    folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="ROOT")] = None
+    folder: Annotated[
+        tyro.conf.Positional[Path | None],
+        tyro.conf.arg(metavar="ROOT", help_behavior_hint="(required)"),
+    ] = None
     """Folder of the dataset in its published layout; for colmap the model (sparse/0), or the
     workspace that contains it."""
     root: Path | None = None
