@@ -54,6 +54,11 @@ _REQUEST_BODY = {
     },
 }
 
+_CAMERA_FORM = (
+    'a camera is JSON, as in {"model": "PINHOLE", "width": 1920, "height": 1080, "params": '
+    "[1371, 1371, 960, 540]}"
+)
+
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -112,7 +117,7 @@ def read_camera(text: str) -> Camera:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         where = ".".join(["camera", *map(str, first["loc"][:2])])
-        raise DataError(f"{where}: {first['msg']}") from error
+        raise DataError(f"{where}: {first['msg']}; {_CAMERA_FORM}") from error
 
 
 def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> ImageQuery:
@@ -281,6 +286,8 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
             ),
         ] = None,
     ) -> Response:
+        if unknown := set(request.query_params) - {"camera"}:
+            raise HTTPException(422, f"unknown parameter {min(unknown)!r}; there is only `camera`")
         answer = await service.answer(request, camera)
         return Response(answer.model_dump_json(), media_type="application/json")
 

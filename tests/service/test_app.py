@@ -140,7 +140,7 @@ def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
 @pytest.mark.parametrize(
     "camera, words",
     [
-        ("{", "camera: Invalid JSON"),
+        ("PINHOLE,400,300,300,300,200,150", 'camera: Invalid JSON.*as in {"model": "PINHOLE"'),
         ({"model": "FISHEYE"}, "unknown camera model 'FISHEYE'; known: "),
         ({"width": 4000}, "the image is 400x300 as stored, but its camera says 4000x300"),
         ({"path": "/etc/passwd"}, "camera.path: Unexpected keyword argument"),
@@ -151,6 +151,12 @@ def test_invalid_cameras_are_refused(
 ) -> None:
     sent = photos[0].camera_json(**camera) if isinstance(camera, dict) else camera
     refused(client.post("/localize", **photos[0].form(sent)), 422, words)
+
+
+def test_misspelt_parameters_are_refused(client: TestClient, photos: list[Photo]) -> None:
+    """An ignored camera would give a less accurate pose."""
+    sent = {"params": {"cam": photos[0].camera_json()}, "content": photos[0].content}
+    refused(client.post("/localize", **sent), 422, "unknown parameter 'cam'")
 
 
 @pytest.mark.parametrize(
