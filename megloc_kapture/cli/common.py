@@ -19,7 +19,7 @@ import tyro
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.io.text_lines import read_cameras
+from megloc_kapture.io.text_lines import camera_of, fields_of, read_cameras
 from megloc_kapture.pipeline.executors import (
     LOG_FORMAT,
     ExecutorKind,
@@ -75,8 +75,8 @@ def print_counts(counts: Mapping[str, float]) -> None:
 def camera_of_text(text: str) -> Camera:
     """Parse ``MODEL,WIDTH,HEIGHT,PARAMETERS``."""
     try:
-        model, width, height, *params = text.split(",")
-        return Camera(model.strip(), int(width), int(height), tuple(map(float, params)))
+        model, *numbers = fields_of(text)
+        return camera_of(model, numbers)
     except (ValueError, DataError) as error:
         reason = error.message if isinstance(error, DataError) else "neither a file nor a camera"
         raise OptionError(

@@ -182,6 +182,11 @@ def test_a_map_whose_points_contradict_its_keypoints_is_refused_unless_forced(
     assert len(read_status(tmp_path / "localized" / "status.csv")) == 4
 
 
+@pytest.mark.parametrize("text", ["PINHOLE,640.0,480.0,51,52,32,24", "PINHOLE 640 480 51 52 32 24"])
+def test_a_camera_is_read_as_in_a_list_of_cameras(text: str) -> None:
+    assert cameras_of_text(text) == Camera("PINHOLE", 640, 480, (51, 52, 32, 24))
+
+
 def test_a_camera_may_be_longer_than_a_file_name() -> None:
     """COLMAP writes 17 digits per parameter."""
     params = (*(1234.5678901234567,) * 4, *(-0.0012345678901234567,) * 8)
