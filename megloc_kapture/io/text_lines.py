@@ -134,7 +134,7 @@ def read_camera_rows(path: Path) -> dict[str, Camera]:
                     "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "
                     f"{', '.join(CAMERA_MODEL_NUM_PARAMS)}"
                 )
-            name = check_relative(row["name"].removeprefix("./"))
+            name = check_relative(row["name"].removeprefix("./").removeprefix("/"))
             require(name not in cameras, f"{name!r} is listed twice")
             cameras[name] = camera_of(row["model"], fields_of(row["numbers"]))
     require(cameras, "no camera in this list", path=path)

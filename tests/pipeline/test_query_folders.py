@@ -135,8 +135,8 @@ def test_a_list_has_the_camera_of_each_image(
         write(tmp_path / "query" / name)
     (tmp_path / "cameras.txt").write_text(
         "# NAME MODEL WIDTH HEIGHT PARAMS\n"
-        "query/day/1.jpg PINHOLE 64 48 51 51 32 24\n"
-        "./query/night/1.jpg PINHOLE 64.0 48.0 52 52 32 24\n"
+        "./query/day/1.jpg PINHOLE 64 48 51 51 32 24\n"
+        "/data/query/night/1.jpg PINHOLE 64.0 48.0 52 52 32 24\n"
         "query/day/2 b.jpg, SIMPLE_RADIAL, 128, 96, 106, 64, 48, 0.1\n"
     )
     cameras = read_cameras(tmp_path / "cameras.txt")
