@@ -443,7 +443,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
         else:
             raise DataError("no such file or folder", path=path)
         for name, file in files.items():
-            if by_name.get(name, file) != file:
+            if name in by_name and by_name[name].resolve() != file.resolve():
                 raise DataError(
                     f"{by_name[name]} would have the same image name; give a common parent folder",
                     path=file,

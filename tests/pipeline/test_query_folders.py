@@ -41,7 +41,7 @@ def test_names_are_paths_below_the_given_folders(tmp_path: Path) -> None:
     (tmp_path / "in" / "notes.txt").write_text("no image")
     other = write(tmp_path / "e.jpg")
     write(tmp_path / "in" / "f.jpg").rename(tmp_path / "in" / "frame_000007")
-    photos = Photographs([tmp_path / "in", other, other])
+    photos = Photographs([tmp_path / "in", other, tmp_path / "in" / ".." / "e.jpg"])
     assert photos.names == ["a dir/c.PNG", "b.jpg", "e.jpg", "frame_000007"]
     assert list(photos.unreadable) == ["raw.NEF"]
     assert ".nef cannot be read" in photos.unreadable["raw.NEF"].lower()
