@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -143,13 +144,25 @@ class QueryImage(ProcessedFrame):
         return pose
 
     def _own_mask(self) -> dict[str, NDArray[np.bool_]]:
-        mask = self.query.read_mask()
+        with self._failing_alone():
+            mask = self.query.read_mask()
         return {} if mask is None else {"own": mask}
 
     @property
     def depth(self) -> DepthView | None:
         depth = self.query.depth
-        return depth if depth is None or isinstance(depth, DepthView) else depth()
+        with self._failing_alone():
+            return depth if depth is None or isinstance(depth, DepthView) else depth()
+
+    @contextmanager
+    def _failing_alone(self) -> Iterator[None]:
+        """Blame errors of the mask or the depth on the image, whose query then fails alone."""
+        try:
+            yield
+        except DataError as error:
+            if not isinstance(self.query.image, str | Path):
+                raise
+            raise DataError(str(error), path=self.query.image) from error
 
     @property
     def feature_mask(self) -> NDArray[np.bool_] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from megloc_kapture import Failure, KaptureMap, Localizer, Pose, Query
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import shift_principal_point
+from megloc_kapture.io.images import read_depth_map, write_image
 from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
@@ -329,6 +331,22 @@ def test_an_unreadable_image_among_many_fails_alone(
     results = list(localizer.localize_many([(kind(broken), camera), queries[0]]))
     assert isinstance(results[0], Failure) and str(broken) in results[0].reason
     assert isinstance(results[1], Pose)
+
+
+@pytest.mark.parametrize("kind", ["mask", "depth"])
+def test_a_query_with_a_broken_mask_or_depth_fails_alone(
+    workspace: Path, image: Path, truth: KaptureData, tmp_path: Path, kind: str
+) -> None:
+    write_image(tmp_path / "mask.png", np.zeros((10, 10), np.uint8))
+    (tmp_path / "depth").write_bytes(b"short")
+    read = partial(read_depth_map, tmp_path / "depth", width=300, height=200)
+    broken = {"mask": tmp_path / "mask.png", "depth": read}[kind]
+    options = options_of_preset(assignments=["pose_refinement.by=icp"])
+    localizer = Localizer(KaptureMap.open(workspace / "map"), options=options)
+    query = Query(truth.camera_of("0004.jpg"), image, "0004.jpg")
+    failure, pose = localizer.localize_many([replace(query, **{kind: broken}), query])
+    assert isinstance(failure, Failure) and str(tmp_path / kind) in failure.reason
+    assert isinstance(pose, Pose)
 
 
 def test_an_image_that_the_extractor_rejects_fails_alone(
