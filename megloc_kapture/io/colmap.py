@@ -28,6 +28,7 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 # minimum number of residuals for multithreading, so high that COLMAP always uses a single thread
 NEVER = 2**31 - 1
+_STDERR = threading.Lock()
 
 
 @lru_cache(maxsize=1)
@@ -46,15 +47,16 @@ def load_pycolmap() -> Any:
 @contextmanager
 def quiet_stderr() -> Iterator[None]:
     # COLMAP writes progress to file descriptor 2 at every log level
-    saved = os.dup(2)
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(null)
+    with _STDERR:  # the last of several threads would restore what another has silenced
+        saved = os.dup(2)
+        null = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(null, 2)
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            os.close(null)
 
 
 # ------------------------------------------------------------------------------------ cameras

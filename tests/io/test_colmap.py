@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -21,6 +24,7 @@ from megloc_kapture.io.colmap import (
     TriangulationOptions,
     load_pycolmap,
     px_from_cam,
+    quiet_stderr,
     triangulate,
     write_model,
 )
@@ -181,6 +185,22 @@ def model_of_two_groups(folder: Path, num_shared: int) -> object:
         observed.append((np.arange(100), rows))
     write_model(folder, images, observed, points, np.zeros((len(points), 3)))
     return load_pycolmap().Reconstruction(str(folder))
+
+
+def test_several_threads_leave_standard_error_as_it_was() -> None:
+    def silence(begin_s: float) -> None:
+        time.sleep(begin_s)
+        with quiet_stderr():
+            time.sleep(0.2)
+
+    saved, before = os.dup(2), os.fstat(2)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(silence, (0.0, 0.1)))
+        assert os.path.samestat(os.fstat(2), before)
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
 
 
 def test_a_keypoint_with_two_points_keeps_the_first(tmp_path: Path) -> None:
