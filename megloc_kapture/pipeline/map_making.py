@@ -319,7 +319,7 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     digest = hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
     folder = user_cache() / "maps"
     kept = folder / f"{place.name[:40]}-{digest}"
-    if (kept / _STAMP).is_file() and (kept / _STAMP).read_bytes() == stamp:
+    if _has_stamp(kept, stamp):
         return kept
     made = folder / temporary_name()
     try:
@@ -327,8 +327,9 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
         made.mkdir()
         import_colmap(source, made, work=work)
         write_bytes(made / _STAMP, stamp)
-        remove(kept)
-        made.rename(kept)
+        if not _has_stamp(kept, stamp):  # else another process has imported and may read it
+            remove(kept)
+            made.rename(kept)
     except OSError as error:
         remedy = "; XDG_CACHE_HOME sets another cache folder"
         raise output_error(folder, error, remedy=remedy) from error
@@ -336,6 +337,11 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
         with contextlib.suppress(OSError):
             remove(made)
     return kept
+
+
+def _has_stamp(folder: Path, stamp: bytes) -> bool:
+    path = folder / _STAMP
+    return path.is_file() and path.read_bytes() == stamp
 
 
 def _stamp(source: ColmapFolders) -> str:

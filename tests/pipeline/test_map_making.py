@@ -24,6 +24,7 @@ from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.map_making import (
     describe_map,
+    import_colmap,
     kapture_of,
     options_of_photographs,
     plan_photographs,
@@ -81,6 +82,22 @@ def test_a_changed_model_is_imported_again(workspace: Path) -> None:
     kapture_of(workspace)
     assert link.resolve() == (workspace / "sparse" / "images").resolve()
     assert [path.name for path in (user_cache() / "maps").iterdir()] == [first.name]
+
+
+def test_a_map_that_another_process_imports_meanwhile_is_not_replaced(
+    workspace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other process may be reading it."""
+    inodes, name = list[int](), "megloc_kapture.pipeline.map_making.import_colmap"
+
+    def import_after_another(*given: Any, **named: Any) -> dict[str, float]:
+        monkeypatch.setattr(name, import_colmap)
+        inodes.append(kapture_of(workspace).stat().st_ino)
+        return import_colmap(*given, **named)
+
+    monkeypatch.setattr(name, import_after_another)
+    assert [kapture_of(workspace).stat().st_ino] == inodes
+    assert len(list((user_cache() / "maps").iterdir())) == 1
 
 
 def test_a_cache_that_cannot_be_written_names_the_setting(workspace: Path) -> None:
