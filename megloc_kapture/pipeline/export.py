@@ -59,6 +59,8 @@ _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
     "SIMPLE_RADIAL": ("OPENCV", ("k1",)),
     "RADIAL": ("OPENCV", ("k1", "k2")),
     "OPENCV": ("OPENCV", ("k1", "k2", "p1", "p2")),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1",)),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2")),
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
 _UNDISTORT = "nerfstudio can read the output of `megloc export colmap --undistort`"

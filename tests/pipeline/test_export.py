@@ -55,6 +55,8 @@ def image(
         Camera("SIMPLE_RADIAL", 640, 480, (500, 320, 240, 0.1)),
         Camera("OPENCV", 640, 480, (500, 510, 320, 240, 0.1, 0.01, 0.001, 0.002)),
         Camera("OPENCV_FISHEYE", 640, 480, (500, 510, 320, 240, 0.1, 0.01, 0.001, 0.002)),
+        Camera("SIMPLE_RADIAL_FISHEYE", 640, 480, (500, 320, 240, 0.1)),
+        Camera("RADIAL_FISHEYE", 640, 480, (500, 320, 240, 0.1, 0.01)),
     ],
     ids=lambda camera: camera.model,
 )
