@@ -16,6 +16,7 @@ import megloc_kapture as megloc
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.images import read_image_rgb, read_photo
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.preprocessing.frames import scaled_camera
 
 SMALL = {"local_features.options.max_keypoints": 800, "global_features.options.num_clusters": 8}
@@ -73,6 +74,25 @@ def test_threads_share_results(built: megloc.Map, results: megloc.Results, scene
     fresh = built.localize(scene / "query")
     with ThreadPoolExecutor(4) as threads:
         assert dict(zip(fresh, threads.map(fresh.get, fresh), strict=True)) == dict(results)
+
+
+def test_interrupted_results_go_on(
+    built: megloc.Map, results: megloc.Results, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after Ctrl-C in a notebook."""
+    again = built.localize(scene / "query")
+    names, localize = list(again), Localizer._localize_unit
+
+    def interrupt(localizer: Localizer, unit: Any) -> Any:
+        if unit[0][0].name == names[2]:
+            raise KeyboardInterrupt
+        return localize(localizer, unit)
+
+    monkeypatch.setattr(Localizer, "_localize_unit", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        dict(again)
+    monkeypatch.undo()
+    assert dict(again) == dict(results)
 
 
 def test_a_table_without_poses_has_their_columns(built: megloc.Map, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs, Queries
 from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.paths import LOCALIZED
+from megloc_kapture.stages.scene import Unit
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
@@ -72,13 +74,18 @@ class Results(Mapping[str, Pose | Failure]):
         if broken := self.queries.unreadable:
             self._found |= {name: unreadable_image(name, reason) for name, reason in broken.items()}
             self._found = dict(sorted(self._found.items()))
-        self._stream = self._localized(workers, track)
+        self._start = partial(self._localized, workers, track)
+        self._stream = self._start()
         self._lock = Lock()  # for threads that share the results
 
     def __getitem__(self, name: str) -> Pose | Failure:
         with self._lock:
             while (outcome := self._found[name]) is None:
-                other, result = next(self._stream)
+                try:
+                    other, result = next(self._stream)
+                except BaseException:
+                    self._stream = self._start()  # for the next access: this one is exhausted
+                    raise
                 self._found[other] = result
         return outcome
 
@@ -142,14 +149,17 @@ class Results(Mapping[str, Pose | Failure]):
 
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         executor = ThreadPoolExecutor(workers)
+        missing = [
+            unit for unit in self._units if any(self._found[name] is None for name, _ in unit)
+        ]
         try:
-            units = (tuple((self._query(name), at) for name, at in unit) for unit in self._units)
+            units = (tuple((self._query(name), at) for name, at in unit) for unit in missing)
             results = self.localizer.localize_units(units, executor)
-            tracked = track(results, len(self._units), "localizing")
+            tracked = track(results, len(missing), "localizing")
             if isinstance(self.queries, Photographs):
                 alone = [outcome for (outcome,) in tracked]
-                tracked = ([outcome] for outcome in self._with_shared_cameras(alone))
-            for unit, outcomes in zip(self._units, tracked, strict=True):
+                tracked = ([outcome] for outcome in self._with_shared_cameras(missing, alone))
+            for unit, outcomes in zip(missing, tracked, strict=True):
                 for (name, _), result in zip(unit, outcomes, strict=True):
                     if isinstance(result, Failure) and name in self.queries.faults:
                         result = replace(result, reason=self.queries.faults[name])
@@ -159,9 +169,11 @@ class Results(Mapping[str, Pose | Failure]):
             # that holds locks needed to stop the workers
             executor.shutdown(wait=False)
 
-    def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
+    def _with_shared_cameras(
+        self, units: Sequence[Unit], results: list[Pose | Failure]
+    ) -> list[Pose | Failure]:
         data, of_sensor = self.queries.data(), defaultdict(list)
-        for at, (((name, _),), result) in enumerate(zip(self._units, results, strict=True)):
+        for at, (((name, _),), result) in enumerate(zip(units, results, strict=True)):
             if isinstance(result, Pose):
                 of_sensor[data.record_of(name)[1]].append((at, result))
         for members in of_sensor.values():
