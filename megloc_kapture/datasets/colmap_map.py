@@ -110,7 +110,7 @@ def find_colmap(
 
 
 def _models(path: Path) -> list[Path]:
-    around = path if path.name == SPARSE else path / SPARSE
+    around = path if os.path.basename(os.path.abspath(path)) == SPARSE else path / SPARSE
     for places in ([path], [around], sorted(around.glob("*"))):
         folders = [place for place in places if _holds_model(place)]
         if folders:

@@ -223,8 +223,9 @@ def test_images_and_database_are_searched_near_the_model(
     (room / "dense" / "sparse").symlink_to(model)
     assert find_colmap(room / "dense") == ColmapFolders(room / "dense" / "sparse", None, None)
     monkeypatch.chdir(room / "sparse")
-    relative = find_colmap(Path("0"))
-    assert relative.images is not None and relative.images.samefile(room / "images")
+    for here in ("0", "."):
+        relative = find_colmap(Path(here))
+        assert relative.images is not None and relative.images.samefile(room / "images")
 
 
 def test_ambiguous_and_missing_models_are_refused(room: Path) -> None:
