@@ -98,6 +98,12 @@ def evaluate(
     align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
     """
     check_option(align in get_args(Align), f"align is {align!r}; give none, se3 or sim3")
+    for poses in (estimated, truth):
+        check_option(
+            isinstance(poses, Path | str | Mapping),
+            "poses are a kapture folder, a pose file, a COLMAP model, or image -> cam_from_world, "
+            f"got {type(poses).__name__}",
+        )
     given = () if thresholds is None else thresholds
     bounds = [_threshold(each) for each in ([given] if isinstance(given, str) else given)]
     benchmark = benchmark_near(

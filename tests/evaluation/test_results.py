@@ -239,12 +239,13 @@ def test_arguments_from_python(world: Any, tmp_path: Path) -> None:
         ({"thresholds": (0.1, 1)}, r"be \(metres, degrees\) pairs, got 0\.1"),
         ({"align": "sim"}, "align is 'sim'; give none, se3 or sim3"),
         ({"align": None}, "align is None; give"),
+        ({"truth": list(world.truth.values())}, "or image -> cam_from_world, got list"),
         ({"side_tables": tmp_path / "no"}, "no: no such folder"),
         ({"side_tables": tmp_path}, r"neither protocol\.json nor groups\.csv; give the folder m"),
         ({"mapping": tmp_path / "no"}, "no: no such folder"),
     ):
         with pytest.raises(MeglocError, match=message):
-            evaluate(world.truth, world.truth, **wrong)
+            evaluate(world.truth, **{"truth": world.truth, **wrong})
 
 
 def test_labels_do_not_decide_the_type_of_a_column(world: Any) -> None:
