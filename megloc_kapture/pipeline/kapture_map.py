@@ -123,7 +123,9 @@ class KaptureMap:
             f"pixel_origin is {pixel_origin!r}; give auto, corner or centre",
         )
         dirs = [features_dirs] if isinstance(features_dirs, Path | str) else features_dirs
-        folder = KaptureFolder(path, features_dirs=dirs)
+        # files are read when they are needed, perhaps after os.chdir
+        absolute = [Path(each).absolute() for each in (path, *dirs)]
+        folder = KaptureFolder(absolute[0], features_dirs=absolute[1:])
         for features_dir in folder.features_dirs:
             require(features_dir.is_dir(), "no such features folder", path=features_dir)
         data = folder.read()
