@@ -75,6 +75,13 @@ class Query:
         check_camera(self.camera)
         object.__setattr__(self, "prior", _names(self.prior))
         object.__setattr__(self, "candidates", _names(self.candidates))
+        for local_type, local in self.features.items():
+            shapes = np.shape(local.keypoints_px), np.shape(local.descriptors)
+            require(
+                list(map(len, shapes)) == [2, 2] and shapes[0][0] == shapes[1][0],
+                f"query {self.name}: {local_type} has keypoints {shapes[0]} and descriptors "
+                f"{shapes[1]}, not (N, 2 or more) and (N, D)",
+            )
 
     def read_mask(self) -> NDArray[np.bool_] | None:
         """Return the mask, bool (H, W), True = use, or None."""
@@ -160,7 +167,7 @@ class QueryImage(ProcessedFrame):
         try:
             yield
         except DataError as error:
-            if not isinstance(self.query.image, str | Path):
+            if error.path is None or not isinstance(self.query.image, str | Path):
                 raise
             raise DataError(str(error), path=self.query.image) from error
 

@@ -333,6 +333,23 @@ def test_an_unreadable_image_among_many_fails_alone(
     assert isinstance(results[1], Pose)
 
 
+def test_a_map_survives_a_change_of_the_working_folder(
+    workspace: Path, queries: list[Query], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(workspace)
+    localizer = Localizer(KaptureMap.open("map"))
+    monkeypatch.chdir(tmp_path)
+    assert localizer.localize_query(queries[0])
+
+
+def test_features_of_unequal_lengths_are_refused(queries: list[Query]) -> None:
+    """Their keypoints would have the descriptors of others."""
+    local = queries[0].features["rootsift"]
+    with pytest.raises(DataError, match=r"keypoints \(799, 2\) and descriptors \(800, 128\)"):
+        shorter = replace(local, keypoints_px=local.keypoints_px[1:])
+        replace(queries[0], features={"rootsift": shorter})
+
+
 @pytest.mark.parametrize("kind", ["mask", "depth"])
 def test_a_query_with_a_broken_mask_or_depth_fails_alone(
     workspace: Path, image: Path, truth: KaptureData, tmp_path: Path, kind: str
