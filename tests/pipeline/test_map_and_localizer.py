@@ -357,7 +357,7 @@ def test_a_query_with_a_broken_mask_or_depth_fails_alone(
     write_image(tmp_path / "mask.png", np.zeros((10, 10), np.uint8))
     (tmp_path / "depth").write_bytes(b"short")
     read = partial(read_depth_map, tmp_path / "depth", width=300, height=200)
-    broken = {"mask": tmp_path / "mask.png", "depth": read}[kind]
+    broken: Any = {"mask": tmp_path / "mask.png", "depth": read}[kind]
     options = options_of_preset(assignments=["pose_refinement.by=icp"])
     localizer = Localizer(KaptureMap.open(workspace / "map"), options=options)
     query = Query(truth.camera_of("0004.jpg"), image, "0004.jpg")

@@ -155,7 +155,10 @@ def test_invalid_cameras_are_refused(
 
 def test_misspelt_parameters_are_refused(client: TestClient, photos: list[Photo]) -> None:
     """An ignored camera would give a less accurate pose."""
-    sent = {"params": {"cam": photos[0].camera_json()}, "content": photos[0].content}
+    sent: dict[str, Any] = {
+        "params": {"cam": photos[0].camera_json()},
+        "content": photos[0].content,
+    }
     refused(client.post("/localize", **sent), 422, "unknown parameter 'cam'")
 
 
