@@ -233,7 +233,7 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     with pytest.raises(megloc.OptionError, match="has its own cameras"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)
-    with pytest.raises(megloc.DataError, match="features: no such folder of features"):
+    with pytest.raises(megloc.DataError, match="features: no such features folder"):
         megloc.open_map(built.kapture_map.folder.root, features_dirs="features")
     with pytest.raises(megloc.OptionError, match=r"give map=m\.kapture_map for a Map m"):
         megloc.export("ply", tmp_path / "map.ply", map=built)  # type: ignore[arg-type]

@@ -159,8 +159,8 @@ def normal_equations(rows, groups, squared_scale, sums):
     A point's ``e^2`` is the mean of its squared residuals over channels, and its cost is Geman and
     McClure's ``s^2 / 2  e^2 / (s^2 + e^2)``; an infinite s^2 gives least squares. The results are
     added to ``sums``: the matrix of the pose (6, 6), upper half; pose with gain and bias (G, C, 6,
-    2); entries (gain, gain), (gain, bias) and (bias, bias) (G, C, 3); gradients of the pose (6,)
-    and of gain and bias (G, C, 2).
+    2); entries (gain, gain), (gain, bias) and (bias, bias) (G, C, 3); gradients for the pose (6,)
+    and for gain and bias (G, C, 2).
     """
     pose, mixed, blocks, pose_gradient, own_gradient = sums
     channels = rows.shape[1]

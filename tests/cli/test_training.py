@@ -160,7 +160,7 @@ def test_views_between_the_cameras_can_be_merged_with_the_map(
     [
         ([], "give one of --pose .*, --along and --between"),
         (["POSE"], "--pose needs --camera"),
-        (["POSE", "--camera", CAMERA_TEXT, "--appearance", "me.jpg"], "not trained on an image"),
+        (["POSE", "--camera", CAMERA_TEXT, "--appearance", "me.jpg"], "not trained on image"),
         (["--between", "absent"], "absent"),
         (["--pose=1,0,0", "--camera", CAMERA_TEXT], "qw,qx,qy,qz,tx"),
         (["--pose=2,0,0,0,0,0,0", "--camera", CAMERA_TEXT], "qw,qx,qy,qz,tx"),

@@ -118,7 +118,7 @@ def test_a_single_result_and_one_without_poses(second: Result) -> None:
 
 
 def test_empty_or_equal_labels_are_refused(first: Result) -> None:
-    with pytest.raises(DataError, match="no query"):
+    with pytest.raises(DataError, match="there are no queries"):
         evaluate_without_truth([Result("x", {}, ())])
     for results in ([first, first], []):
         with pytest.raises(OptionError, match="labels must differ"):

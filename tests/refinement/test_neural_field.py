@@ -208,7 +208,7 @@ def test_invalid_training_is_refused() -> None:
     with pytest.raises(DataError, match="no pixel"):
         FieldTrainer([hidden, hidden], QUICK).train()
     field, _ = FieldTrainer(views(4, depth=False), QUICK.model_copy(update={"steps": 1})).train()
-    with pytest.raises(DataError, match="not trained on an image 'x'"):
+    with pytest.raises(DataError, match="not trained on image 'x'"):
         field.appearance_of("x")
 
 

@@ -374,8 +374,8 @@ def test_wrong_refiners_are_refused(
     folders, options = (world.mapping(), world.query(), localized), Chosen(refiners=(Shift(),))
     for answer, message in (
         (None, "refine returned NoneType"),
-        (PoseRefinement(replace(SHIFT, translation=(0, np.nan, 0))), "an invalid pose"),
-        (PoseRefinement(replace(SHIFT, quat_wxyz=(1, 1, 0, 0))), "an invalid pose: Rig"),
+        (PoseRefinement(replace(SHIFT, translation=(0, np.nan, 0))), ".* an invalid pose"),
+        (PoseRefinement(replace(SHIFT, quat_wxyz=(1, 1, 0, 0))), ".* an invalid pose: Rig"),
     ):
         monkeypatch.setattr(Shift, "refine", lambda *_, answer=answer: answer)
         with pytest.raises(PluginError, match=f"'shift' on image .*: {message}"):

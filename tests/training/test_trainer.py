@@ -358,7 +358,7 @@ def test_unsuitable_networks_are_refused(files: dict[str, str], tmp_path: Path) 
     with pytest.raises(OptionError, match="superpoint and xfeat can be trained, not those of root"):
         describer_of(RootSift())
     assert encoder_sizes(256) == (32, 64, 128, 256, 256)
-    with pytest.raises(OptionError, match="multiple of 8 dimensions, not 100"):
+    with pytest.raises(OptionError, match="multiple of 8, not 100"):
         encoder_sizes(100)
     options = SuperPointOptions(weights=files["xfeat"], device="cpu")
     with pytest.raises(DataError, match="does not fit SuperPointNet"):
