@@ -113,7 +113,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         path = next((path for path in folders if is_kapture(path)), None)
         return None if path is None else KaptureFolder(path, features_dirs=features)
 
-    units = map(unit_of, filter(None, (workspace or folder, mapping)))
+    units = [unit_of(place) for place in (workspace or folder, mapping) if place is not None]
     return ResultContext(
         queries=first(queries),
         mapping=KaptureFolder(mapping, features_dirs=features) if mapping else first(maps),
