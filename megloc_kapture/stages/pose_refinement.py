@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.csv_table import write_records
 from megloc_kapture.io.dataset_tables import (
@@ -334,7 +334,12 @@ def _refine(
     if data.sensors[data.record_of(image)[1]].is_unknown:
         query = localized  # it has the camera that was estimated with the pose
     scene, camera = KaptureScene(mapping, query), query.read().camera_of(image)
-    return apply_refiners(image, camera, pose, references, distrusted, refiners, scene)
+    try:
+        return apply_refiners(image, camera, pose, references, distrusted, refiners, scene)
+    except DataError as error:
+        if error.path is None or not Path(error.path).is_relative_to(query.root):
+            raise
+        return replace(pose, remarks=(*pose.remarks, f"not refined: {error}"))
 
 
 class RefinePoses(PipelineStage):

@@ -351,6 +351,18 @@ def test_rejected_refinements_keep_the_covariance(
     assert options.refiners[0].asked[first] == [min(world.map_poses)]
 
 
+def test_a_query_with_a_broken_file_keeps_its_pose(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    first, broken = min(world.query_poses), tmp_path / "query"
+    write_sensors(broken, world.query().read())
+    folders = world.mapping(), KaptureFolder(broken), localized
+    refine_poses(*folders, tmp_path / "out", Chosen(refiners=(Shift(),)))
+    assert KaptureFolder(tmp_path / "out").read().poses()[first] == world.query_poses[first]
+    assert "not refined: " in status_table(tmp_path / "out").remarks[first]
+    assert first in status_table(tmp_path / "out").remarks[first]
+
+
 def test_a_pose_is_refined_with_the_focal_length_that_was_estimated_with_it(
     world: Any, tmp_path: Path
 ) -> None:
