@@ -69,8 +69,8 @@ _INDEPENDENT = 30
 # matches were verified with the given focal length, which biases the estimate towards it by this
 # share of their difference
 _BIASED_BY = 0.1
-# a photograph whose focal length differs from the shared one by more standard deviations was taken
-# with a different zoom
+# a photograph whose focal length differs from the shared one by more than this many standard
+# deviations was taken at a different zoom
 _MAX_SIGMAS = 3.0
 # factor on the standard deviation of the shared focal length, because errors of the map and of the
 # lens model are correlated between photographs
@@ -204,7 +204,7 @@ def _freed(
 
 
 def misfits_text(results: Iterable[LocalizationResult], where: str) -> str | None:
-    """Summarize how many queries have a given focal length that does not fit."""
+    """Report how many queries have a focal length, as given, that does not fit."""
     count = sum(any(_DOES_NOT_FIT in remark for remark in result.remarks) for result in results)
     if not count:
         return None
@@ -328,7 +328,7 @@ def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
     known = max(given.focal_deviation, camera.focal_deviation)
-    # a well-known focal length comes from calibration or several images, as do the other intrinsics
+    # an accurate focal length comes from calibration or several images, as do the other intrinsics
     deviation = min(_PRINCIPAL_POINT_DEVIATION, known) * max(camera.width, camera.height) / focal
     change = [math.log(focal_px(given) / focal), *shift]
     deviations = [known, deviation, deviation]
@@ -425,8 +425,8 @@ def _free_camera(
 def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, Floats]:
     """Return residuals (N, 2) of points in front of the camera and their derivatives (N, 2, 6 + C).
 
-    The columns are a left rotation, a translation and ``change``; distortion slopes are ignored in
-    the pose columns.
+    The columns are a left rotation, a translation and ``change``; the pose columns ignore how the
+    distortion factor changes with the point's position.
     """
     x, y, z = points.T
     u, v = x / z, y / z
@@ -464,7 +464,7 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
 
 
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
-    """Re-solve poses of photographs of one camera with a shared estimate of its intrinsics.
+    """Re-solve poses of photographs taken by one camera with a shared estimate of its intrinsics.
 
     A pose is kept as it is if its focal length contradicts the shared one (a different zoom) or if
     it was refined by another method.

@@ -210,7 +210,7 @@ def _structure_options(
             require(name in photographs.names, f"--scale: there is no photograph {name!r}")
     elif scale:
         raise OptionError(
-            f"--scale takes {GPS}, or two photographs and the metres between them, got "
+            f"--scale takes {GPS}, or two photographs and their distance in metres, got "
             f"{' '.join(scale)!r}"
         )
     known = {"known_cameras": photographs.has_known_cameras(), "distance": distance, "gps": gps}
@@ -222,7 +222,7 @@ def plan_photographs(
 ) -> list[Stage]:
     """Return the stages that map photographs.
 
-    ``scale`` is empty, ``gps``, or two photographs and the metres between their cameras.
+    ``scale`` is empty, ``gps``, or two photographs and the distance of their cameras in metres.
     """
     structure = _structure_options(photographs, mapper, scale)
     check_weights(options)
@@ -286,7 +286,7 @@ def import_colmap(
     if source.images is None and source.database is None and not len(read.model.points):
         _log.warning(
             "%s has no points, no images and no database: it becomes a kapture folder of poses, "
-            "not a map (`megloc import colmap --images` or `--database` give it features)",
+            "not a map (`megloc import colmap` with --images or --database gives it features)",
             source.model,
         )
         read.write_images(output)
@@ -327,7 +327,9 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
         made.mkdir()
         import_colmap(source, made, work=work)
         write_bytes(made / _STAMP, stamp)
-        if not _has_stamp(kept, stamp):  # else another process has imported and may read it
+        if not _has_stamp(
+            kept, stamp
+        ):  # else another process has imported it and may be reading it
             remove(kept)
             made.rename(kept)
     except OSError as error:

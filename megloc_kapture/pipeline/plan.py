@@ -1,4 +1,4 @@
-"""Runs of stages in order; a stage runs only if necessary."""
+"""Run stages in order, without those that are up to date."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class Manifest(Options):
     options: dict[str, Any]
     inputs: dict[str, str] = Field(description="fingerprints of the inputs by name")
     fingerprint: str
-    output: str = Field(description="fingerprint for stages that read the outputs")
+    output: str = Field(description="fingerprint of the outputs, for stages that read them")
     outputs: tuple[str, ...]
     counts: dict[str, int | float] = Field(default_factory=dict)
     seconds: float
@@ -221,9 +221,9 @@ def run_plan(
 ) -> list[StageReport]:
     """Run the stages that are out of date, or report them in a ``dry_run``.
 
-    The stage ``first`` and its dependents run again, and stages before it are kept. Stages after
-    ``last`` do not run. ``say`` receives a line when a stage starts, with the reason, and a line
-    when it ends.
+    The stage ``first`` and its dependents run again; stages before it are skipped and their outputs
+    used as they are. Stages after ``last`` do not run. ``say`` receives a line when a stage starts,
+    with the reason, and a line when it ends.
     """
     names = [stage.name for stage in stages]
     for name in (first, last):
@@ -326,7 +326,7 @@ def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
 
 
 def _earlier_inputs(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[str, str]:
-    """Return fingerprints, by stage, of the inputs that only stages of earlier runs wrote."""
+    """Return fingerprints, by stage, of inputs written by stages that are not in this plan."""
     written = [path for other in stages for path in other.writes]
     missing = [path for path in stage.reads if not is_below(path, *written)]
     if not missing:

@@ -1,8 +1,8 @@
 """Execution context: ordered work with bounded memory, a progress bar, and network batches.
 
 Work runs on an executor with one core per process. Networks on a GPU of this machine run only in
-this process. In batched work (:class:`Batched`), threads then read items ahead, one thread computes
-the batches, and the executor runs the last step.
+this process. In that case batched work (:class:`Batched`) is pipelined: threads read items ahead,
+one thread computes the batches, and the executor runs the last step.
 """
 
 from __future__ import annotations

@@ -147,7 +147,12 @@ MILLIMETRES = np.array([[0, 1523, 8000.0]], "<f4").tobytes()
         ("table.csv", "image\na\n", csv_table, ":1: .*header"),
         ("table.csv", "image,reason,extra\na,b,c\n", csv_table, ":1: .*header"),
         ("table.csv", b"image,reason\na,\xff\n", csv_table, ":2: .*UTF-8"),
-        ("points3d.txt", points_with("1,2,3,4,5"), read_points3d, "not a table of 3 or 6 columns"),
+        (
+            "points3d.txt",
+            points_with("1,2,3,4,5"),
+            read_points3d,
+            "not a table with 3 or 6 columns",
+        ),
         ("points3d.txt", points_with("1,2,3,4,5,"), read_points3d, "could not convert string ''"),
         ("points3d.txt", points_with("1,2,3,4,5,nan"), read_points3d, "point 20 is not finite"),
         ("o.txt", observations_with("5, t, a, 1, b"), read_observations, "expected point3d_id"),

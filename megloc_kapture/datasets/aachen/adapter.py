@@ -162,7 +162,7 @@ class Layout:
     def _centred(self, nvm: NvmModel, position: int) -> Camera:
         """Return the NVM's camera with a centred principal point.
 
-        As far as known, all published cameras are centred.
+        As far as we know, this holds for all published cameras.
         """
         name = nvm.names[position]
         width, height = image_size(self.images / name)

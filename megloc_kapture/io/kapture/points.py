@@ -39,7 +39,7 @@ _PLY_TYPES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 def read_points3d(path: Path) -> NDArray[np.float64]:
     """Read ``points3d.txt`` as float64 (N, 6): X Y Z R G B, colours 0 if missing."""
-    what = "a table of 3 or 6 columns in all rows"
+    what = "a table with 3 or 6 columns in every row"
     with reading(path, what), open(path, encoding="utf-8-sig", errors="replace") as file:
         check_version(path, file.readline(), required=False)
         file.seek(0)
