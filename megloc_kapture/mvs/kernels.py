@@ -190,7 +190,7 @@ def count_agreeing(
                 continue
             back_x = (g[0, 0] * u + g[0, 1] * v + g[0, 2] + c[0] * other_inverse) / qz
             back_y = (g[1, 0] * u + g[1, 1] * v + g[1, 2] + c[1] * other_inverse) / qz
-            # (back_x, back_y, 1) qz is K X / z', X the point in this view, z' its depth in the other
+            # (back_x, back_y, 1) qz = K X / z', X the point in this view, z' its depth in the other
             depth = qz / other_inverse
             if (back_x - x) ** 2 + (back_y - y) ** 2 > max_px * max_px:
                 continue
