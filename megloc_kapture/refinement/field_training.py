@@ -202,7 +202,8 @@ class _Pixels:
     def __init__(self, views: Sequence[PosedImage], max_side_px: int) -> None:
         pixels = [pixels_of(view, max_side_px) for view in views]
         self._cameras = list(dict.fromkeys(camera for camera, *_ in pixels))
-        self._camera_of = np.array([self._cameras.index(camera) for camera, *_ in pixels])
+        number_of = {camera: number for number, camera in enumerate(self._cameras)}
+        self._camera_of = np.array([number_of[camera] for camera, *_ in pixels])
         self._poses = [view.cam_from_world for view in views]
         self._starts = np.cumsum([0, *(len(rgb) for _, rgb, _, _ in pixels)])
         self._rgb = np.concatenate([rgb for _, rgb, _, _ in pixels])
