@@ -390,7 +390,8 @@ class Pose(LocalizationResult):
     inlier_points_px, inlier_points_world : float64 (num_inliers, 2) and (num_inliers, 3), in the
         query's pixels and in the map; None if not kept.
     covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit, of
-        a left perturbation of ``cam_from_world``.
+        a left perturbation of ``cam_from_world``. It covers noise of keypoints and points, but no
+        errors of map poses and calibration, which are larger on real scenes.
     camera : camera with the focal length that was estimated with the pose, and its deviation; None
         if the focal length was known.
     evidence : terms of the confidence, see :mod:`megloc_kapture.localization.confidence`.

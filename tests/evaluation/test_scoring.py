@@ -72,7 +72,7 @@ def test_share_of_errors_within_covariances(times: float, low: float, high: floa
     check = evaluation.covariance
     assert check is not None and check["num_poses"] == 300
     assert low < check["num_within"] / 300 < high
-    line = f"Covariance: {check['num_within']} of 300 errors lie within the estimated 95 % region."
+    line = f"Covariance: {check['num_within']} of 300 errors lie within the estimated 95 % region"
     assert line in report_text(evaluation)
     assert plain(report_data(evaluation))["covariance"] == check
     assert "Covariance" not in report_text(evaluate_poses(estimated, truth))

@@ -115,7 +115,10 @@ def _facts(reported: Reported) -> list[_Fact]:
             facts.append((f"Confidence{whose}: {'; '.join(sentences)}.", None))
         if (check := evaluation.covariance) is not None:
             errors = content.counted(check["num_poses"], "error lies", "errors lie")
-            sentence = f"{check['num_within']} of {errors} within the estimated 95 % region."
+            sentence = (
+                f"{check['num_within']} of {errors} within the estimated 95 % region, which "
+                "does not cover errors of map poses and calibration."
+            )
             facts.append((f"Covariance{whose}: {sentence}", None))
     if isinstance(reported, Comparison):
         sentences = content.comparison_sentences(reported)
