@@ -83,6 +83,9 @@ def test_surprise_against_the_binomial_distribution() -> None:
     alone = -binom.logsf(36, 197, share) / math.log(10)
     tests = math.log10(197) + math.log10(math.comb(40, 3)) + 3
     assert surprise > alone - tests
+    # less surprising than 40 of 197 at the smallest radius
+    least = np.pi * 0.5**2 / (640 * 480)
+    assert surprise < -binom.logsf(39, 197, least) / math.log(10)
 
 
 def test_the_number_of_views_does_not_matter() -> None:
