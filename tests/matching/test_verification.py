@@ -45,6 +45,16 @@ WIDE = [
     Camera("OPENCV", 900, 700, (350.0, 340.0, 450.0, 350.0, -0.25, 0.08, 2e-3, -1e-3)),
 ]
 
+
+@pytest.mark.parametrize("camera", WIDE, ids=lambda camera: camera.model)
+def test_slopes_are_the_derivatives_of_rays(camera: Camera) -> None:
+    pixels = np.random.default_rng(0).uniform((150, 100), (750, 600), (40, 2))
+    moves = 0.01 * np.eye(2)
+    ends = [(bearing_rays(camera, pixels + m) - bearing_rays(camera, pixels - m)) for m in moves]
+    expected = np.stack(ends, axis=2)[:, :2] / 0.02
+    np.testing.assert_allclose(seen(camera, pixels)[1], expected, rtol=1e-3, atol=1e-7)
+
+
 B_FROM_A = rigid([0.02, -0.15, 0.05], [-1.0, 0.1, 0.2])
 
 
