@@ -18,6 +18,7 @@ from megloc_kapture.evaluation.comparison import (
 )
 from megloc_kapture.evaluation.evaluate import results_without_truth
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.content import result_table
 from megloc_kapture.evaluation.report.reports import render_report, report_text
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.io.dataset_tables import (
@@ -85,6 +86,7 @@ def test_counts_and_inliers(result: WithoutTruth) -> None:
     quartiles = inliers_quartiles(result.evaluations[0], "all")
     assert quartiles == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
     assert inliers_quartiles(result.evaluations[0], "night") is None
+    assert result_table(result.evaluations[0])["%"].tolist()[-1] == "50.0"
     other = result.evaluations[1].rows[-1]
     assert (other.num_localized, other.num_missing) == (3, 1)
     assert inliers_quartiles(result.evaluations[1], "all") is None

@@ -111,6 +111,13 @@ def test_text_of_two_results(world: Any) -> None:
     assert "localized localizes 8 queries that fewer misses" in " ".join(text.split())
     # long labels are cut, in the table only
     assert "/data/xxxxxxx...xxx/localized" in text
+    # equal results, with poses and without any
+    for estimated, sentence in (
+        (world.estimated, "A and B localize the same "),
+        ({}, "neither A nor B localizes any query."),
+    ):
+        twins = [evaluation_of(replace(world, estimated=estimated), label) for label in "AB"]
+        assert sentence in " ".join(report_text(compare(twins)).split())
 
 
 def test_queries_are_shown_the_worst_first() -> None:
