@@ -99,7 +99,7 @@ def test_variants_of_other_tools_are_read(tmp_path: Path, text: str) -> None:
 
 def test_rows_without_a_pose_are_misses(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "poses.txt"
-    path.write_text(f"{GOOD}b.jpg nan nan nan nan nan nan nan\nc.jpg 0 0 0 0 0 0 0\n")
+    path.write_text(f"{GOOD}b.jpg nan nan nan nan nan nan nan\nc.jpg 0 0 0 0 1 2 3\n")
     assert list(read_pose_file(path)) == ["a.jpg"]
     assert "2 rows of nan or zeros are read as queries without a pose, such as b.jpg" in caplog.text
     rows = "# src tgt tx ty tz qx qy qz qw\n1,2,1.5,-0.2,3,0.8,0,0,0.6\r\n1 3 0 0 0 nan 0 0 1\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -228,6 +229,9 @@ def test_pose_files_and_folders_have_equal_figures(tmp_path: Path) -> None:
     )
     assert half.row("b").num_missing == 0
     assert half.row("c").num_missing == 3
+    renamed = shutil.copyfile(files / "reloc_b.txt", tmp_path / "mine.txt")
+    with pytest.raises(DataError, match="rename it to one of reloc_b.txt, reloc_c.txt"):
+        evaluate_results([renamed], workspace / "query_gt", rules, mapping=workspace / "mapping")
     # a dummy row in place of a missing pose counts as missing
     first, *others = (files / "reloc_b.txt").read_text().splitlines()
     rows = [" ".join([*first.split()[:2], "0 0 0 0 0 0 1"]), *others]
