@@ -86,7 +86,9 @@ def test_counts_and_inliers(result: WithoutTruth) -> None:
     quartiles = inliers_quartiles(result.evaluations[0], "all")
     assert quartiles == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
     assert inliers_quartiles(result.evaluations[0], "night") is None
-    assert result_table(result.evaluations[0])["%"].tolist()[-1] == "50.0"
+    table = result_table(result.evaluations[0])
+    assert table["%"].tolist()[-1] == "50.0"
+    assert table["inliers, quartiles"].tolist()[1:] == ["-", "40 / 60 / 80"]
     other = result.evaluations[1].rows[-1]
     assert (other.num_localized, other.num_missing) == (3, 1)
     assert inliers_quartiles(result.evaluations[1], "all") is None
