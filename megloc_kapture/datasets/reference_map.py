@@ -87,7 +87,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def feature_type(self) -> tuple[str, str] | None:
         """Return type name and dtype of all features, or None if there are no descriptors.
 
-        Tools with a matcher of their own store zeros instead of descriptors.
+        Tools with their own matcher store zeros instead of descriptors.
         """
         with self._reading():
             first = next(self._rows("SELECT data FROM descriptors WHERE rows > 0"), None)

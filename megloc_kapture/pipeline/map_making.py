@@ -327,9 +327,8 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
         made.mkdir()
         import_colmap(source, made, work=work)
         write_bytes(made / _STAMP, stamp)
-        if not _has_stamp(
-            kept, stamp
-        ):  # else another process has imported it and may be reading it
+        # with the stamp, another process has imported it meanwhile and may be reading it
+        if not _has_stamp(kept, stamp):
             remove(kept)
             made.rename(kept)
     except OSError as error:
